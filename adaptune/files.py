@@ -12,6 +12,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO
 
@@ -38,15 +39,43 @@ class FullError(AdaptuneError, OSError):
     """There is no room for a file."""
 
 
+def process_name(pid: int) -> str | None:
+    """What names a process for good; None if there is none."""
+    try:
+        started = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except OSError:
+        return None
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    # Processes of another container have other numbers.
+    space = os.stat("/proc/self/ns/pid").st_ino  # noqa: PTH116
+    return f"{boot}.{space}.{pid}.{started}"
+
+
 def temporary_prefix() -> str:
     """Path with which the names of this process's temporary folders begin."""
-    return str(Path(tempfile.gettempdir()) / f"adaptune-{os.getpid()}-")
+    return str(Path(tempfile.gettempdir()) / f"adaptune-{process_name(os.getpid())}-")
+
+
+@cache
+def _remove_left(folder: Path) -> None:
+    """Remove temporary folders of processes of this machine that were killed."""
+    here = str(process_name(os.getpid())).rsplit(".", 2)[0]
+    for left in folder.glob(f"adaptune-{here}.*"):
+        owner = left.name.removeprefix("adaptune-").rpartition("-")[0]
+        if process_name(int(owner.split(".")[-2])) != owner:
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def make_temporary() -> Path:
+    """Make a folder, which the caller removes; if it is killed, the next adaptune does."""
+    _remove_left(Path(tempfile.gettempdir()))
+    return Path(tempfile.mkdtemp(prefix=temporary_prefix()))
 
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
     """A folder for the block; what cannot be removed afterwards stays."""
-    folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+    folder = make_temporary()
     try:
         yield folder
     finally:

@@ -404,9 +404,7 @@ def drive_whole(
                 for n in sorted(lacking) if bare else numbers:
                     archive.trial_path(name, n, True, bare).unlink(missing_ok=True)
                     schedule.add(name, n, sets[n])
-        for name, n, trial in schedule.run(workers):
-            if n < len(labels) and not bare:
-                check_baseline(labels[n], name, trial)
+        for name, n, trial in _checked(schedule, workers, [] if bare else labels):
             schedule.store(name, n, trial)
 
     drive(dict.fromkeys(names, sets), "whole drives")
@@ -451,8 +449,7 @@ def run_baseline(
     done: dict[tuple[str, int], Trial] = {}
 
     def drive() -> None:
-        for name, number, trial in schedule.run(workers):
-            check_baseline(labels[number], name, trial)
+        for name, number, trial in _checked(schedule, workers, labels):
             done[name, number] = trial
 
     drive()
@@ -483,13 +480,31 @@ def _contradicted(
     return True
 
 
+def _checked(
+    schedule: Schedule, workers: Pool[Any], labels: Sequence[str]
+) -> Iterator[tuple[str, int, Trial]]:
+    """Run a schedule; a baseline that had a fault, with which all is compared, drives once more."""
+    again = set()
+    for name, number, trial in schedule.run(workers):
+        if number < len(labels):
+            if trial.faults and not trial.failure and (name, number) not in again:
+                again.add((name, number))
+                what = "sequences.%s: %s has a fault with its own parameters, so once more: %s"
+                _log.warning(what, name, labels[number], trial.faults[-1])
+                schedule.add(name, number, trial.parameters)
+                continue
+            check_baseline(labels[number], name, trial)
+        yield name, number, trial
+
+
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
-    """Refuse a baseline that failed, by a BaselineError; a fault now and then does no harm."""
-    if not run.failure:
+    """Refuse a baseline that failed, or had a fault, by a BaselineError."""
+    if not (run.failure or run.faults):
         return
-    last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
+    said = run.faults[-1] if run.faults else "it gave no pose, and no reason"
+    said = f"{run.failure}; {said}" if run.failure else said
     raise BaselineError(
         f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: "
-        f"{run.failure}; {last}: mend the odometry (odometry in the study), or leave the sequence "
-        f"out, and run the same command again"
+        f"{said}: mend the odometry (odometry in the study), or leave the sequence out, and run "
+        f"the same command again"
     )

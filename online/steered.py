@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptune.errors import OdometryError
+from adaptune.errors import OdometryError, warn_once
 from adaptune.geometry import Poses, invert, to_pose
 from adaptune.odometry.base import OdometryInstance, Registration
 from adaptune.recording.pose_messages import POSES
@@ -23,8 +23,6 @@ from adaptune.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 
 ODOMETRY = "nav_msgs/msg/Odometry"
-PATIENCE = 0.3
-"""Seconds after a scan in which the node's pose must be there."""
 SILENT = 10
 """Scans of which most have no pose; then the log says so."""
 _COMMAND = 5.0
@@ -56,6 +54,7 @@ class SteeredNode(OdometryInstance):
             _run,
         )
         self._silent: deque[bool] = deque(maxlen=SILENT)
+        self._missed: deque[int] = deque(maxlen=KEPT)  # stamps of scans without a pose in time
         self._warned = False
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
@@ -64,16 +63,19 @@ class SteeredNode(OdometryInstance):
     ) -> None:
         # The node goes on; its motions continue from here.
         self._begun, self._T_odom_node = (prepared.stamp, np.array(T_odom_sensor)), None
+        self._submitted = prepared.stamp
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: Scan) -> None:
-        self._submitted = prepared.stamp
+        self._step, self._submitted = prepared.stamp - self._submitted, prepared.stamp
 
     def _collect(self) -> Registration:
-        T_node = self._pose(self._submitted, PATIENCE)
+        T_node = self._pose(self._submitted, self._settings.patience)
         T_odom_sensor = np.full((4, 4), np.nan)
         known = bool(np.isfinite(T_node).all())
         self._silent.append(not known)
+        if not known:
+            self._missed.append(self._submitted)
         self._tell_of_silence()
         if known:
             if self._T_odom_node is None:
@@ -118,6 +120,19 @@ class SteeredNode(OdometryInstance):
                 if not self._poses or stamp > self._poses[-1][0]:
                     self._poses.append((stamp, T @ self._T_base_sensor))
                 self._news.notify()
+                self._tell_of_missed(stamp)
+
+    def _tell_of_missed(self, stamp: int) -> None:
+        """Log, once, whether poses that were missed came late, by that of a stamp, or never."""
+        settings, steps = self._settings, np.diff([at for at, _ in self._poses][-SILENT:])
+        while self._missed and self._missed[0] <= stamp:
+            late = stamp - self._missed.popleft() < 0.5 * self._step
+            if not late and (len(steps) < 2 or steps[-1] <= 1.5 * np.median(steps)):
+                continue  # its habit
+            why = f"come later than online.ros.steer.patience ({settings.patience:g} s) allows"
+            why += ": raise it, or let less run on this machine"
+            lost = "never come, and later ones do: is the node too slow, or does it lose clouds?"
+            warn_once(f"{settings.odometry}: some poses of {settings.node} {why if late else lost}")
 
     def _pose(self, stamp: int, seconds: float) -> Poses:
         """The node's pose at a stamp, of shape (4, 4); NaN if it does not come in time."""

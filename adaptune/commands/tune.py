@@ -144,6 +144,7 @@ def _look(path: Path) -> bool:
         raise AdaptuneError(f"{path}, line {', '.join(lacking)}: fill in what stands as {LACKING}")
     from adaptune.odometry.docker.probe import far_ends, look
 
+    load(path, [], None, runs=True)  # what is not installed is told as by other commands
     name = loaded.config.training[0]
     scans = loaded.sequences.open(name)
     first = next(iter(scans)).stamp
@@ -270,7 +271,7 @@ def tune(
     limits = (trials, minutes, budget)
     asked = Asked(recordings, odometry, points, reference, config, test, reading, {}, *limits)
     with progress() as show:
-        if (path := proposed_system(asked, show)) is None:
+        if (path := proposed_system(asked, folder, show)) is None:
             tuned = tune_asked(asked, override, folder, cluster, show)
     if path is not None:
         say(
@@ -278,6 +279,8 @@ def tune(
             f"docs/docker.md#a-ros-2-system says. Then look at what the system does:"
         )
         say(f"  adaptune inspect {path}")
+        if folder is not None:
+            say(f"Name the folder again where results go there, too: --folder {folder}")
         return
     _say_untuned(tuned.study)
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)

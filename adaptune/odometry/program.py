@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +22,7 @@ from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, t
 from adaptune.metrics import window_ends
 from adaptune.odometry.base import BaseSettings, Description, OwnFile, Registration, Usage
 from adaptune.odometry.faults import Faulting, pose_fault
+from adaptune.odometry.own_frame import duration_of
 from adaptune.odometry.remote import Arguments, Limits
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.recording.config import SequenceConfig, Transform, resolve
@@ -42,6 +44,7 @@ class ProgramInput(NamedTuple):
     stamps: NDArray[np.int64]  # nanoseconds, of shape (n,)
     T_ref_sensor: Poses | None  # of shape (n, 4, 4), NaN where there is no reference
     logs: Path | None = None  # folder for what a program leaves behind, one folder a parameter set
+    span: int = 0  # nanoseconds from a scan's stamp to its last point
 
 
 def program_input(
@@ -62,30 +65,30 @@ def program_input(
     with (folder.parent / f".{folder.name}.lock").open("w") as lock:
         locked(lock)
         if _about(folder) != about:
-            stamps: list[int] = []
+            taken: list[tuple[int, int]] = []
             with replacing_folder(folder) as temporary:
                 temporary.mkdir()
+                scans = _note_stamps(sequence, taken)
                 if own is None:
-                    scans = _note_stamps(sequence, stamps)
                     export(scans, sequence.imu(), temporary / name, layout)
-                else:
-                    stamps += [scan.stamp for scan in sequence]
-                np.save(temporary / "stamps.npy", np.array(stamps, np.int64))
+                deque(scans, 0)
+                np.save(temporary / "stamps.npy", np.array(taken, np.int64).reshape(-1, 2).T)
                 (temporary / "about.json").write_text(json.dumps(about), encoding="utf-8")
-        at = np.load(folder / "stamps.npy")
+        at, spans = np.load(folder / "stamps.npy")
+    span = int(np.median(spans)) if len(spans) else 0
     reference = sequence.reference()
     T_ref_sensor = None if reference is None else reference.at(at)
     if own is None:
         imu = "" if sequence.imu() is None else IMU
-        return ProgramInput(folder / name, POINTS, imu, at, T_ref_sensor)
+        return ProgramInput(folder / name, POINTS, imu, at, T_ref_sensor, span=span)
     source: Any = getattr(sequence, "source", None)
     imu = "" if config.imu is None else config.imu.topic or ""
-    return ProgramInput(own, config.points or source.points, imu, at, T_ref_sensor)
+    return ProgramInput(own, config.points or source.points, imu, at, T_ref_sensor, span=span)
 
 
-def _note_stamps(sequence: Recording, stamps: list[int]) -> Iterator[Scan]:
+def _note_stamps(sequence: Recording, taken: list[tuple[int, int]]) -> Iterator[Scan]:
     for scan in sequence:
-        stamps.append(scan.stamp)
+        taken.append((scan.stamp, duration_of(scan)))
         yield scan
 
 
@@ -141,6 +144,7 @@ class WholeSettings(BaseSettings):
     """What all odometries that run whole recordings may set."""
 
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame whose poses are written
+    pose_time: Literal["stamp", "end"] = "stamp"  # the moment of a scan that its pose is of
 
 
 class WholeRun(Faulting):
@@ -152,6 +156,8 @@ class WholeRun(Faulting):
     """
 
     _words = ""  # the last lines that the program wrote
+    _unanswered: NDArray[np.bool_] | slice = slice(0)  # scans that got no pose of their own
+    _help = ""  # what to do about them
 
     def __init__(
         self,
@@ -241,6 +247,9 @@ class WholeRun(Faulting):
         with temporary_folder() as folder:
             try:
                 trajectory = self.trajectory(given, folder)
+                if self.settings.pose_time == "end":
+                    later, T = trajectory.stamps + given.span, trajectory.T_world_sensor
+                    trajectory = Trajectory(later, T)
                 if self.settings.extrinsic is not None:
                     T = trajectory.T_world_sensor @ to_pose(self.settings.extrinsic)
                     trajectory = Trajectory(trajectory.stamps, T)
@@ -251,7 +260,9 @@ class WholeRun(Faulting):
                 self._lacking = int((np.abs(nearest).min(axis=0) > 0.6 * spacing).sum())
                 known = np.isfinite(T_own_sensor[:, 0, 0])
                 if known.mean() < _COVERAGE:
-                    when = when_known(known, given.stamps)
+                    # All who count the scans without a pose are to count the same.
+                    T_own_sensor[self._unanswered], known[self._unanswered] = np.nan, False
+                    when = when_known(known, given.stamps) + self._help
                     failure = f"it gave poses for {known.sum()} of {len(known)} scans; {when}"
             except UnavailableError:
                 raise

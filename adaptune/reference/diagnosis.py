@@ -26,6 +26,7 @@ from adaptune.geometry import (
     to_quaternions,
 )
 from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Hops, register
+from adaptune.metrics import sub_trajectory_rte
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.content import Content
 from adaptune.recording.scan import Recording, Scan
@@ -118,6 +119,9 @@ CLOCK = 30.0  # seconds by which clocks may differ to be found
 FAR_APART = 0.25  # seconds between poses, from which on the way between them is not straight
 TURNED = 0.1
 """Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
+END_LENGTH, ENDS = 10.0, 0.8
+"""Metres over which poses of scans' ends show, and the share of the error that is left at most
+where they are taken as these."""
 SAME_CLOCK = 0.01  # seconds by which two clocks may differ and count as the same
 
 
@@ -443,17 +447,18 @@ def contradictions(
     reference came with the recording.
     """
     stamps: list[int] = []
+    spans: list[int] = []
     content, carried = Content(), Carried()
     reference = scans.reference() if given else None
 
     def read() -> Iterator[Scan]:
-        for scan in scans:
-            if seen is None or scan.stamp in seen:
-                stamps.append(scan.stamp)
-                content.see(scan)
-                if reference is not None:
-                    carried.see(scan, pose_at(reference, scan.stamp))
-                yield scan
+        for scan in (scan for scan in scans if seen is None or scan.stamp in seen):
+            stamps.append(scan.stamp)
+            spans.append(scan.span)
+            content.see(scan)
+            if reference is not None:
+                carried.see(scan, pose_at(reference, scan.stamp))
+            yield scan
 
     passing = read()
     hops = measured_motions(passing, len(T_odom_sensor))
@@ -471,20 +476,45 @@ def contradictions(
         if (cause := diagnose_reference(reference, at, hops, place)) is not None:
             yield cause.below((CONTRADICTS,))
         elif _surely_worse(wrong, others):
-            why = UNEXPLAINED * (_mean(wrong) > SUSPICIOUS)
-            what = (
-                f"over some metres they differ by {_mean(wrong):.3g} %, by registrations of scans, "
-                f"and the odometry by {_mean(others):.3g} %{why}; sets that differ by less cannot "
-                f"be told apart"
-            )
-            mend = (
-                "use `reference: estimated` or a longer sub_trajectory, or check its file or topic "
-                "(`reference`), the LiDAR's pose in its frame (`extrinsic`) and its clock "
-                "(`clock_offset`)"
-            )
-            yield Finding((CONTRADICTS,), what, mend, of="reference")
+            yield _unexplained(_mean(wrong), _mean(others))
+        elif (cause := _of_ends(reference, at, np.median(spans), T_odom_sensor)) is not None:
+            yield cause
     if (cause := diagnose_odometry(T_odom_sensor, hops)) is not None:
         yield cause.below(("the odometry's poses contradict the scans",))
+
+
+def _unexplained(wrong: float, others: float) -> Finding:
+    """That a reference has so many percent where an odometry has others."""
+    why = UNEXPLAINED * (wrong > SUSPICIOUS)
+    what = (
+        f"over some metres they differ by {wrong:.3g} %, by registrations of scans, and the "
+        f"odometry by {others:.3g} %{why}; sets that differ by less cannot be told apart"
+    )
+    mend = (
+        "use `reference: estimated` or a longer sub_trajectory, or check its file or topic "
+        "(`reference`), the LiDAR's pose in its frame (`extrinsic`) and its clock (`clock_offset`)"
+    )
+    return Finding((CONTRADICTS,), what, mend, of="reference")
+
+
+def _of_ends(
+    reference: Trajectory, stamps: NDArray[np.int64], span: float, T_odom_sensor: Poses
+) -> Finding | None:
+    """Whether an odometry's poses fit the reference best about one scan later than their stamps."""
+    shares = (0.0, 1.0, -1.0, -0.5, 0.5, 1.5, 2.0)
+    at = [reference.at(stamps + round(share * span)) for share in shares]
+    errors = [_mean(sub_trajectory_rte(T, T_odom_sensor, END_LENGTH)) for T in at]
+    if not span > 0 or errors[1] > min(ENDS * errors[0], *errors[2:]) or np.isnan(errors).any():
+        return None
+    what = (
+        f"they fit the reference best {1e-9 * span:.2g} s, about one scan, after their stamps "
+        f"({errors[1]:.3g} % over {END_LENGTH:g} m instead of {errors[0]:.3g} %)"
+    )
+    mend = (
+        "a system that gives the pose of a scan's end needs odometry.settings.pose_time: end; if "
+        "it does not, the reference is of another clock (`clock_offset`)"
+    )
+    return Finding(("the odometry's poses",), what, mend, of="reference")
 
 
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

@@ -285,10 +285,10 @@ class DdsLink:
         if response is not None:
             return response
         services = self._places()
-        raise LinkError(
-            f"{node} does not answer: {place} in ROS domain {self.domain}; the services there are "
-            f"{', '.join(services) or 'none'}"
-        )
+        why = f"the services there are {', '.join(services) or 'none'}"
+        if place in services:
+            why = f"it is there, but busy for {_ANSWER:g} s or more; it may still take what it got"
+        raise LinkError(f"{node} does not answer: {place} in ROS domain {self.domain}; {why}")
 
     def endpoints(
         self, which: int, topic: str | None = None, *, own: bool = False

@@ -120,6 +120,7 @@ class SteerConfig(StrictModel):
     odometry: RosName  # topic of its poses, nav_msgs/Odometry
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame whose poses it publishes
     command: SetCommand | None = None  # otherwise parameters are set through ROS
+    patience: float = Field(0.3, gt=0, le=3600)  # seconds from a scan to its pose
 
 
 class RosConfig(StrictModel):

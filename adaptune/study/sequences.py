@@ -191,8 +191,8 @@ class StudySequences:
     def program_input(self, name: str) -> ProgramInput:
         """A sequence as a program reads it."""
         folder = self.folder / "inputs" / name
-        # 4: with the inputs by name.
-        about = {"version": 4, "input": self.layout} | self.identity(name)
+        # 5: with the time that a scan takes.
+        about = {"version": 5, "input": self.layout} | self.identity(name)
         key = str(folder), json.dumps(about)
         if key not in _inputs:
             config = self.config(name)

@@ -382,17 +382,26 @@ def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> No
         raise AdaptuneError(f"{error}; or give a --reference") from error
 
 
+_TOPIC = re.compile(r"(?:topic|\w*(?:points|cloud|lidar)\w*):=(/\w[\w/]*)")
+"""An argument that names the clouds' topic."""
+
+
 def _system_of(given: str) -> dict[str, Any] | None:
     """The image or the launch command of a ROS system, as settings; None if it is none."""
     words = words_of(given)
-    if words[:1] == ["ros2"]:
-        if not any("{parameters}" in word for word in words):
-            words.append(f"{LACKING}:={{parameters}}")
-        return {"command": words}
-    if not is_image(given):
-        return None
-    launch = ["ros2", "launch", LACKING, f"{LACKING}.launch.py", f"{LACKING}:={{parameters}}"]
-    return {"image": given, "command": launch}
+    image: dict[str, Any] = {}
+    if words[:1] != ["ros2"]:
+        if not is_image(given):
+            return None
+        image, words = {"image": given}, ["ros2", "launch", LACKING, f"{LACKING}.launch.py"]
+    file, points = [f"{LACKING}:={{parameters}}"], [f"{LACKING}:={{points}}"]
+    if words[1:2] == ["run"]:
+        words += ["--ros-args"] * ("--ros-args" not in words)
+        file, points = ["--params-file", "{parameters}"], ["-r", *points]
+    topic = next(filter(None, map(_TOPIC.fullmatch, words)), None)
+    words += file * ("{parameters}" not in given)
+    words += points * (topic is None and "{points}" not in given)
+    return image | {"command": words, "points": topic[1] if topic else "/points"}
 
 
 def is_image(given: str) -> bool:
@@ -412,22 +421,22 @@ def is_image(given: str) -> bool:
     return True
 
 
-def proposed_system(asked: Asked, show: Progress) -> Path | None:
+def proposed_system(asked: Asked, folder: Path | None, show: Progress) -> Path | None:
     """Write a study of a ROS system to fill in; None if the odometry is none."""
     if (settings := _system_of(asked.odometry)) is None:
         return None
-    path = Path(f"{plain_name(asked.recordings[0].resolve())}_ros2.yaml")
+    path = (folder or Path()) / f"{plain_name(asked.recordings[0].resolve())}_ros2.yaml"
     if path.exists():
         raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
     named, test = recorded(asked, show)
     settings |= {
         "template": str(asked.config.resolve()) if asked.config else LACKING,
         "odometry": f"/{LACKING}",
-        "points": "/points",
     }
     below: YamlPath = ("odometry", "settings")
     comments: dict[YamlPath, str] = ROLES | {
         ("odometry", "name"): "Or rustle, for a ROS 1 system, see docs/docker.md.",
+        (*below, "command"): "{points} is the topic below; an argument that is not needed can go.",
         (*below, "template"): "The parameter file that you use now.",
         (*below, "odometry"): "The topic of its poses.",
         (*below, "points"): "The topics that it hears, as imu: /imu",

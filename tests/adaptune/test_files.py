@@ -1,11 +1,15 @@
 import errno
 import os
+import signal
+import subprocess
+import sys
+import tempfile
 
 import pytest
 
 from adaptune.compiled import compiled
 from adaptune.errors import lacking
-from adaptune.files import locked, replacing, write_text
+from adaptune.files import locked, make_temporary, replacing, temporary_folder, write_text
 
 
 def test_a_file_appears_when_all_went_well(tmp_path):
@@ -43,6 +47,39 @@ def test_two_writers_do_not_meet(tmp_path):
         second.write_text("second")
     assert path.read_text() == "first"
     assert list(tmp_path.iterdir()) == [path]
+
+
+LEAVES = """
+import sys
+from adaptune.files import make_temporary
+folder = make_temporary()
+(folder / "link").touch()
+print(folder, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_what_a_killed_process_leaves_is_removed_by_the_next_one(tmp_path, monkeypatch, number):
+    def begin():
+        piped = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen([sys.executable, "-c", LEAVES], text=True, **piped)
+        return process, process.stdout.readline().strip()
+
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    other = tmp_path / "adaptune-of-the-user"
+    other.mkdir()
+    (killed, left), (alive, used) = begin(), begin()
+    killed.send_signal(number)
+    killed.wait()
+    assert sorted(map(str, tmp_path.iterdir())) == sorted([left, used, str(other)])
+    own = make_temporary()
+    assert sorted(map(str, tmp_path.iterdir())) == sorted([used, str(own), str(other)])
+    with temporary_folder() as folder:
+        assert folder.is_dir()
+    assert not folder.exists()
+    alive.communicate("")
 
 
 def test_a_pipe_is_written_to_and_stays(tmp_path):

@@ -1,11 +1,13 @@
 import logging
 import os
+import re
 import shutil
 import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from drives import FIRST_STAMP
 from kills import contents
 
 from adaptune.archive import Archive, Trial
@@ -180,13 +182,32 @@ def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, name, fa
         assert not Archive(study.folder / "trials").read("one", 0).faults
 
 
-def test_a_single_fault_does_no_harm():
+def test_a_baseline_with_a_fault_or_without_poses_is_refused():
     n = 40
-    run = Trial({}, np.tile(np.eye(4), (n, 1, 1)), *np.zeros((4, n)), ("hm",))
+    run = Trial({}, np.tile(np.eye(4), (n, 1, 1)), *np.zeros((4, n)))
     check_baseline("mine", "one", replace(run, unhealthy={"no_pose": 3}))
-    failed = replace(run, failure="no pose for 4 of 40 scans")
+    with pytest.raises(BaselineError, match=r"sequences\.one: mine fails .*baseline: hm: mend"):
+        check_baseline("mine", "one", replace(run, faults=("hm",)))
+    failed = replace(run, faults=("hm",), failure="no pose for 4 of 40 scans")
     with pytest.raises(BaselineError, match=r"sequences\.one: mine fails .*: no pose .*; hm: mend"):
         check_baseline("mine", "one", failed)
+
+
+@pytest.mark.parametrize("name", ["Stumbling", "Apart"])
+def test_a_baseline_with_a_fault_drives_once_more(study_file, tmp_path, caplog, name):
+    """A node may die by chance: where it does not do so again, all is as if it never had."""
+    falls = {"fault": "raise", "at": FIRST_STAMP + 500_000_000}
+    stumble = falls | {"once": f"'{tmp_path}/stumbled'"}
+    train(study_of(study_file, tmp_path / "study", name=name, **stumble))
+    train(study_of(study_file, tmp_path / "sound", name=name))
+    archives = [Archive(tmp_path / folder / "trials") for folder in ("study", "sound")]
+    once, sound = (archive.read("one", 0) for archive in archives)
+    assert not once.faults
+    np.testing.assert_array_equal(once.errors, sound.errors)
+    words = r"has a fault with its own parameters, so once more: .*no planes here"
+    assert len(re.findall(words, caplog.text)) == 1
+    with pytest.raises(BaselineError, match=r"fails with its own parameters.*: .*no planes here"):
+        train(study_of(study_file, tmp_path / "twice", name=name, **falls))
 
 
 @pytest.mark.parametrize(

@@ -6,16 +6,19 @@ import shutil
 from dataclasses import replace
 
 import drives
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
+from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
+from adaptune.progress import unseen
 from adaptune.study.config import ALSO
 from offline.config import load_study
 from online.compare import compare, compared_modes
-from online.modes import MODES, replayed_modes, run_replays, run_untrained
-from online.record import StoredReplayError
+from online.modes import MODES, replay_modes, replayed_modes, run_replays, run_untrained
+from online.record import StoredReplay, StoredReplayError
 
 EVERY = list(MODES)
 
@@ -182,3 +185,24 @@ def test_the_command_line(own, study_file):
         assert done.exit_code == 2
         assert words_ in done.stderr
     assert set(ALSO) < set(EVERY)
+
+
+def test_a_baseline_with_a_fault_is_replayed_once_more(study_file, tmp_path, caplog):
+    at = list(load_study(study_file, [], tmp_path / "any").sequences.open("three"))[5].stamp
+
+    def made(name, once):
+        falls = f"fault: raise, at: {at}, once: {once}"
+        odometry = f"odometry={{name: 'faulty:Apart', settings: {{{falls}}}}}"
+        study = load_study(study_file, [odometry], tmp_path / name)
+        replay_modes(study, ["three"], ["baseline"], unseen)
+        return StoredReplay.read(study.folder / "replays/three/baseline")
+
+    (tmp_path / "fell").touch()
+    sound, found = made("sound", f"'{tmp_path}/fell'"), made("falls", f"'{tmp_path}/once'")
+    assert (found.summary.restarts, found.summary.fault) == (0, "")
+    np.testing.assert_array_equal(found.trajectory.T_world_sensor, sound.trajectory.T_world_sensor)
+    words = "three, baseline: a fault with the odometry's own parameters: "
+    assert [said for said in caplog.messages if words in said and "so once more" in said]
+    with pytest.raises(AdaptuneError, match=f"{words}.*no planes here.*; mend the odometry, or"):
+        made("always", "''")
+    assert not (tmp_path / "always/replays/three/baseline").exists()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import refused
 
-from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.errors import AdaptuneError, OdometryError, warn_once
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.scan import Scan
@@ -170,9 +170,9 @@ def test_a_node_is_steered(make):
     np.testing.assert_allclose(trajectory.T_world_sensor, [T for _, _, T in SCANS], atol=1e-6)
 
 
-def test_the_log_says_once_that_the_odometry_restarts(make, monkeypatch, caplog):
-    monkeypatch.setattr("online.steered.PATIENCE", 0.01)
-    drive(make(STEER), "standby", clouds(), 5)  # the node is silent
+def test_the_log_says_once_that_the_odometry_restarts(make, caplog):
+    steer = STEER.replace("}", ", patience: 0.01}")
+    drive(make(steer), "standby", clouds(), 5)  # the node is silent
     said = "the odometry restarts: the health check found no_pose"
     assert caplog.messages.count(said) == 1
 
@@ -226,11 +226,12 @@ def link():
 
 
 @pytest.fixture
-def node(link, monkeypatch):
-    monkeypatch.setattr("online.steered.PATIENCE", 0.01)
+def node(link):
+    warn_once.cache_clear()
 
     def make(**settings):
-        return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings), "/points")
+        given = {"node": "/node", "odometry": "/odom", "patience": 0.01} | settings
+        return SteeredNode(link, SteerConfig(**given), "/points")
 
     return make
 
@@ -265,6 +266,41 @@ def test_a_node_that_is_silent_gives_no_pose_and_goes_on(link, node):
     play(link, TENTH, 2 * TENTH)
     found = odometry.register(scan(2 * TENTH))
     np.testing.assert_allclose(found.T_odom_sensor, pose(0.2), atol=1e-9)
+
+
+LATE = (
+    "/odom: some poses of /node come later than online.ros.steer.patience (0.01 s) allows: raise "
+    "it, or let less run on this machine"
+)
+LOST = (
+    "/odom: some poses of /node never come, and later ones do: is the node too slow, or does it "
+    "lose clouds?"
+)
+
+
+@pytest.mark.parametrize(
+    ("late", "lost", "each", "told"),
+    [
+        ((), (), 1, []),
+        ((7, 12), (), 1, [LATE]),
+        ((), (7, 12), 1, [LOST]),
+        ((7,), (12,), 1, [LATE, LOST]),
+        ((), (), 2, []),
+        ((8,), (), 2, [LATE]),
+    ],
+)
+def test_a_pose_that_is_missed_came_late_or_never(link, node, caplog, late, lost, each, told):
+    odometry = node()
+    play(link, 0)
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    for i in range(1, 20):
+        given = i not in lost and i % each == 0
+        if given and i not in late:
+            play(link, i * TENTH)
+        assert odometry.register(scan(i * TENTH)).registered == (given and i not in late)
+        if i in late:
+            play(link, i * TENTH)
+    assert caplog.messages == told
 
 
 def test_where_the_clock_goes_back_old_poses_do_not_count(link, node):

@@ -4,6 +4,7 @@ import ctypes
 import os
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ n_instances = 0
 class Settings(BaseSettings):
     fault: str = "none"
     at: int = 300_000_000
+    once: str = ""  # a file; it goes wrong only where it is not there yet
     step: float = 0.3
     axis: int = 0
 
@@ -59,7 +61,7 @@ class Faulty(Odometry):
         self.raise_in("register")
         self.T = self.moved()
         T = self.T.copy()
-        if prepared.stamp == self.settings.at:
+        if prepared.stamp == self.settings.at and self.is_due():
             os.write(1, b"about to go wrong\n")
             self.go_wrong(T)
         if self.settings.fault in WRONG:
@@ -67,6 +69,15 @@ class Faulty(Odometry):
         if self.settings.fault == "shape":
             T = T[:3]
         return Registration(T, n_instances == 1)
+
+    def is_due(self):
+        if not self.settings.once:
+            return True
+        try:
+            Path(self.settings.once).touch(exist_ok=False)
+        except FileExistsError:
+            return False
+        return True
 
     def moved(self):
         T = self.T.copy()

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from adaptune import processes, yaml12
 from adaptune.errors import NotInstalledError, OdometryError, UnavailableError
-from adaptune.files import replacing_folder, temporary_prefix
+from adaptune.files import process_name, replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.docker import remover
@@ -93,25 +93,13 @@ def engine() -> Any:
     return client
 
 
-def _identity(pid: int) -> str | None:
-    """What names a process for good; None if there is none."""
-    try:
-        started = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
-    except OSError:
-        return None
-    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    # Processes of another container have other numbers.
-    space = os.stat("/proc/self/ns/pid").st_ino  # noqa: PTH116
-    return f"{boot}.{space}.{pid}.{started}"
-
-
 def is_orphan(owner: str) -> bool:
     """Whether the process that a label names has ended."""
     boot_and_space, pid, _ = owner.rsplit(".", 2)
-    here = str(_identity(os.getpid())).rsplit(".", 2)[0]
+    here = str(process_name(os.getpid())).rsplit(".", 2)[0]
     if boot_and_space.split(".")[0] != here.split(".")[0]:
         return True
-    return boot_and_space == here and _identity(int(pid)) != owner
+    return boot_and_space == here and process_name(int(pid)) != owner
 
 
 def _remove(client: Any, container: str) -> None:
@@ -126,7 +114,7 @@ def _remove(client: Any, container: str) -> None:
 @cache
 def _owner() -> tuple[str, Any]:
     """Label of this process's containers, and who removes them if it is killed."""
-    owner = str(_identity(os.getpid()))
+    owner = str(process_name(os.getpid()))
     process = subprocess.Popen(
         [sys.executable, remover.__file__, f"{OWNER}={owner}", temporary_prefix()],
         stdin=subprocess.PIPE,  # which closes with this process

@@ -3,31 +3,29 @@
 import contextlib
 import logging
 import shutil
-import tempfile
 import threading
 import time
 import weakref
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adaptune import processes
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, nearest, warn_once
-from adaptune.files import temporary_prefix
+from adaptune.files import make_temporary
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Registration, Usage
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
 from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, matrix
 from adaptune.odometry.faults import Faulting, pose_fault
+from adaptune.odometry.own_frame import END, AtStamp, duration_of
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.export import IMU, POINTS, Messages, measurements, structured
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
-from adaptune.trajectory import Trajectory
 
 _IMU = "sensor_msgs/msg/Imu"
 
@@ -101,12 +99,11 @@ class Lockstep(Faulting):
         self._T_odom_sensor = np.array(T_odom_sensor)
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
-        self._silent, self._stamp, self._poses, self._missed = 0, prepared.stamp, [], []
-        self._n_too_late = 0
+        self._at_stamp, self._T_known = AtStamp(END), T_previous_current
+        self._silent, self._poses, self._missed, self._n_too_late = 0, [], [], 0
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
         self._steady = True  # whether all poses are as late as the first one
-        self._before: tuple[int, Poses] | None = None
         try:
             self._begin(prepared)
             self._show(prepared)
@@ -120,7 +117,7 @@ class Lockstep(Faulting):
             self.note_fault(fault)
 
     def submit(self, prepared: Scan) -> None:
-        self._stamp, self._waiting = prepared.stamp, True
+        self._waiting = True
         if self._system is not None:
             try:
                 self._show(prepared)
@@ -199,26 +196,31 @@ class Lockstep(Faulting):
 
     def _works_on(self, system: RosSystem) -> bool:
         """Whether it uses CPU time now, after its last pose."""
-        self._look(system)
+        self._look(system, fresh=True)
         before = self._used.cpu
         time.sleep(_BACKGROUND)
-        self._look(system)
+        self._look(system, fresh=True)
         return self._used.cpu - before > _BUSY * _BACKGROUND
 
     def __del__(self) -> None:
         self.close()
 
-    def _look(self, system: RosSystem) -> None:
-        """See what the system has used."""
+    def _look(self, system: RosSystem, fresh: bool = False) -> None:
+        """See what the system has used; log, once, which node died where poses come still."""
         self._looked = time.monotonic()
         with contextlib.suppress(OdometryError, LinkError):
-            system.state()
+            system.state(fresh)
         self._used = system.usage
+        if system.died and self._n_answered and not self._silent:
+            warn_once(
+                f"{self.name}: {system.died}, and poses come still; if it is not needed, let the "
+                f"launch file leave it out, as by visualize:=false"
+            )
 
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
         self._template, text = filled(self._settings, self.parameters)
-        self._folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        self._folder = make_temporary()
         try:
             system = self._settings.system(self._settings, self._limits.memory, text, self._folder)
         except AdaptuneError:
@@ -241,7 +243,10 @@ class Lockstep(Faulting):
 
     def _show(self, scan: Scan) -> None:
         """Publish what the system hears until the end of a scan."""
+        self._stamp = scan.stamp
+        self._span = duration_of(scan) if self._settings.pose_time == "end" else 0
         stamp, at = self._shown
+        self._gap = scan.stamp - stamp
         if rate := self._settings.rate:
             time.sleep(max(0.0, at + 1e-9 * (scan.stamp - stamp) / rate - time.monotonic()))
         self._shown = scan.stamp, time.monotonic()
@@ -295,10 +300,16 @@ class Lockstep(Faulting):
                     f"a late pose cannot be told from the next one; raise "
                     f"odometry.settings.patience and isolation.seconds"
                 )
-        T_own = self._at_scan(stamp, T_own @ self._T_base_sensor)
+        T_own = T_own @ self._T_base_sensor
+        # It is of a later moment if its stamp says so, or the user; stamps of a clock say nothing.
+        late, is_first = stamp - self._stamp, self._T_odom_own is None
+        is_later = self._steady and late > 0 and (is_first or late <= 1.5 * self._gap)
+        taken = self._stamp, late if is_later else self._span
         if self._T_odom_own is None:
-            self._T_odom_own = self._T_odom_sensor @ invert(T_own)
-        self._T_odom_sensor = self._T_odom_own @ T_own
+            T_odom_then = self._at_stamp.begin(*taken, self._T_odom_sensor, self._T_known)
+            self._T_odom_own = T_odom_then @ invert(T_own)
+        else:
+            self._T_odom_sensor = self._at_stamp(*taken, self._T_odom_own @ T_own)
         return True
 
     def _check_silent(self, system: RosSystem) -> None:
@@ -308,46 +319,36 @@ class Lockstep(Faulting):
         try:
             system.state()
         except OdometryError as error:
-            if self._n_answered:
+            what = str(error)
+            if self._n_answered or not ("died" in what or "ended" in what):
                 raise
-            help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
-            raise OdometryError(f"{error} before its first pose; {help_}") from error
-        if self._silent >= _MOST_SILENT:
+            # One that ends with a code has said why.
+            help_ = "; if it knows no points but the bag's own, set odometry.settings.play: bag"
+            help_ *= "with code" not in what
+            raise OdometryError(f"{what} before its first pose{help_}") from error
+        n, answered, is_silent = self._n_shown, self._n_answered, self._silent >= _MOST_SILENT
+        if not is_silent and (n < _MOST_SILENT or answered >= _LEAST_ANSWERED * n):
+            return
+        why = self._of_patience() or system.link.why_unheard(self._topics[0])
+        if is_silent:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
             topic = self._settings.odometry
             near = "" if topic in published else nearest(topic, published)
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
             why = (
                 self._reader.lacking
-                or self._of_patience()
-                or system.link.why_unheard(self._topics[0])
+                or why
                 or near * near.startswith("did you mean")
                 or (f"does it need {needs}all that the bag holds (play: bag)?")
             )
             raise OdometryError(
-                f"no pose {'' if self._n_answered else 'yet '}on {self._settings.odometry} for "
-                f"{_MOST_SILENT} scans in a row; topics that are published: "
-                f"{', '.join(sorted(published)) or 'none'}; {why}"
+                f"no pose {'' if answered else 'yet '}on {topic} for {_MOST_SILENT} scans in a "
+                f"row; topics that are published: {', '.join(sorted(published)) or 'none'}; {why}"
             )
-        n, answered = self._n_shown, self._n_answered
-        if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
-            why = (
-                self._of_patience()
-                or system.link.why_unheard(self._topics[0])
-                or "set odometry.settings.play: bag"
-            )
-            raise OdometryError(
-                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; {why}"
-            )
-
-    def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
-        """The pose at the scan's stamp, if the system gives that at the scan's end."""
-        before, self._before = self._before, (stamp, T_own_sensor)
-        # Stamps of a clock say nothing.
-        if before is None or not before[0] <= self._stamp < stamp or not self._steady:
-            return T_own_sensor
-        both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
-        return np.asarray(both.at(np.array([self._stamp], np.int64), 1e9)[0])
+        raise OdometryError(
+            f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; "
+            f"{why or 'set odometry.settings.play: bag'}"
+        )
 
     def _pose(self, seconds: float) -> tuple[int, Poses] | None:
         """The system's pose of the scan that was published last; None if it does not come.

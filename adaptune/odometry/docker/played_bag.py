@@ -208,14 +208,12 @@ class PlayedBag(WholeRun):
             stamps, given.stamps + 2.0 * half
         )
         if (~near).sum() > 0.01 * n:
-            help_ = why or (
-                "if it drops scans, set play: lockstep, a lower rate, or more cpus "
-                "(odometry.settings)"
-            )
+            more = "set play: lockstep, a lower rate, or more cpus (odometry.settings)"
+            self._unanswered, self._help = ~near, f"; {why or f'if it drops scans, {more}'}"
             _log.warning(
-                "%s: %d of %d scans have no pose at rate %g; %s; %s",
+                "%s: %d of %d scans have no pose at rate %g; %s%s",
                 *(self.name, (~near).sum(), n, self.settings.rate),
-                *(when_known(near, given.stamps), help_),
+                *(when_known(near, given.stamps), self._help),
             )
         return trajectory
 

@@ -53,7 +53,7 @@ def look(
     system.came = []
     report: dict[str, str] = {}
     shown: list[tuple[float, int]] = []
-    path, works_on = [np.eye(4)], False
+    path, works_on, why = [np.eye(4)], False, "see what went wrong"
     with closing(system):
         begin, steps = time.monotonic(), iter(scans)
         first = next(steps)
@@ -73,9 +73,12 @@ def look(
                 said = filter(None, (about, other_frame(about, settings)))
                 report["poses are of"] = "; ".join(said)
             works_on = system._works_on(inside)
+            why = "set odometry.settings.play: bag"
+            with suppress(LinkError):
+                why = inside.link.why_unheard(system._topics[0]) or why
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"
-    report |= about_poses(system.came, shown)
+    report |= about_poses(system.came, shown, why)
     report["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
     report["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
@@ -209,12 +212,17 @@ def _declared(system: Any, template: Template) -> dict[str, str]:
     return {"declared, not in the template": ", ".join(own)} if own else {}
 
 
-def about_poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:
-    """What is known of poses, which came at a time with a stamp, from scans that were shown."""
+def about_poses(
+    came: list[tuple[float, int]], shown: list[tuple[float, int]], why: str = "see what went wrong"
+) -> dict[str, str]:
+    """What is known of poses, which came at a time with a stamp, from scans that were shown.
+
+    `why` says what to do where there are too few for lockstep.
+    """
     n, came = len(came), [(t, stamp) for t, stamp in came if t >= shown[0][0]]
     early = {"poses before the first scan": str(n - len(came))} if len(came) < n else {}
     if not came:
-        return early | {"poses": "none", "lockstep": "no: see what went wrong"}
+        return early | {"poses": "none", "lockstep": f"no: {why}"}
     at, stamps = np.array([t for t, _ in shown]), np.array([stamp for _, stamp in shown])
     times = np.array([t for t, _ in came])
     of_scan = np.searchsorted(at, times, "right") - 1
@@ -232,5 +240,5 @@ def about_poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -
         "poses of a scan": f"{len(came) / since:.2f} ({answered} of {since} scans have one)",
         "stamps": f"of {stamped}",
         "lag": f"{1e3 * float(np.median(times - at[of_scan])):.0f} ms",
-        "lockstep": "yes" if fits else "no: set odometry.settings.play: bag",
+        "lockstep": "yes" if fits else f"no: {why}",
     }

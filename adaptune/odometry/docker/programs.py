@@ -2,7 +2,6 @@
 
 import contextlib
 import socket
-import tempfile
 import time
 from contextlib import closing
 from pathlib import Path
@@ -12,7 +11,7 @@ from pydantic import Field
 
 from adaptune import processes
 from adaptune.errors import OdometryError
-from adaptune.files import temporary_prefix
+from adaptune.files import make_temporary
 from adaptune.odometry.base import Description, Usage
 from adaptune.odometry.docker import engine
 from adaptune.odometry.program import (
@@ -132,7 +131,7 @@ class ContainerTransport(processes.Transport):
 
     def connect(self) -> processes.SocketStream:
         """Begin the container, and connect as soon as the program listens."""
-        self._folder = folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        self._folder = folder = make_temporary()
         folder.chmod(0o777)  # for any user of the image
         inside = f"{_FOLDER}/odometry.sock"
         self._container = engine.Container(

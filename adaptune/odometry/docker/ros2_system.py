@@ -90,6 +90,7 @@ class Ros2System(RosSystem):
     _looked = -float("inf")
 
     def _begin(self) -> None:
+        self._dead: dict[bytes, bytes] = {}  # exit codes by nodes
         settings = self._settings
         common = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
         if settings.image is None:
@@ -155,16 +156,18 @@ class Ros2System(RosSystem):
             return None
         return f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
 
-    def state(self) -> dict[str, Any]:
+    def state(self, fresh: bool = False) -> dict[str, Any]:
         now = time.monotonic()
-        if now - self._looked > _BETWEEN_LOOKS:
+        if fresh or now - self._looked > _BETWEEN_LOOKS:
             self._looked = now
             used = self._container.used()
             cpu, memory = max(used.cpu, self.usage.cpu), max(used.memory, self.usage.memory or 0.0)
             self.usage = Usage(cpu, memory)
-            if died := DIED.search(self._tail(self._log_name)):
-                name, code = died[1].decode(), int(died[2])
-                raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
+            self._dead |= dict(DIED.findall(self._tail(self._log_name)))
+        if self._dead:
+            how = [(name, processes.how_it_ended(int(code))) for name, code in self._dead.items()]
+            self.died = "; ".join(f"node {name.decode()} died: {ended}" for name, ended in how)
+            raise OdometryError(self.died)
         if (ended := self._ended()) is not None:
             raise OdometryError(ended)
         topic = self._settings.odometry

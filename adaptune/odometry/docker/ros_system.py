@@ -22,7 +22,7 @@ from rosbags.serde import SerdeError
 
 from adaptune import processes
 from adaptune.errors import OdometryError
-from adaptune.geometry import Poses, to_pose, to_quaternions
+from adaptune.geometry import Poses, invert, to_pose, to_quaternions
 from adaptune.odometry.base import Usage
 from adaptune.odometry.docker import engine
 from adaptune.odometry.program import ProgramInput, WholeSettings
@@ -37,7 +37,7 @@ from adaptune.space import ParameterSet
 QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}  # topics of every node
 CLOCK = "rosgraph_msgs/msg/Clock"
 _BETWEEN_LOOKS = 0.05
-_TAIL = 1 << 14  # bytes of a log in which its last lines are
+_TAIL = 1 << 16  # bytes of a log in which its last lines are
 _TICK = 0.01  # seconds
 _FLOOD = 2000  # messages of a second that are too many
 _log = logging.getLogger(__name__)
@@ -98,6 +98,7 @@ class RosSystem(ABC):
     _container: Any = None
     _user: str  # in a container
     _told = False
+    died = ""  # which of its nodes died, in words
 
     def __init__(
         self,
@@ -140,8 +141,11 @@ class RosSystem(ABC):
         """Why there is no node of adaptune's, and will be none; None while it may come."""
 
     @abstractmethod
-    def state(self) -> dict[str, Any]:
-        """What adaptune's node sees; an `OdometryError` where the system has ended."""
+    def state(self, fresh: bool = False) -> dict[str, Any]:
+        """What adaptune's node sees; an `OdometryError` where the system, or a node, has ended.
+
+        What the system has used may be from a little before, unless it is to be `fresh`.
+        """
 
     @abstractmethod
     def check(self, template: Template, parameters: ParameterSet) -> None:
@@ -354,8 +358,8 @@ class PoseReader:
 
     def _sensor(self, stamps: Mapping[str, int]) -> list[Pose]:
         """The sensor's pose, if the frame that carries it has moved now."""
-        frame, carrier = self._frame, ""
-        if frame not in {**self._fixed, **self._moving}:
+        frame, known = self._frame, {**self._fixed, **self._moving}
+        if frame not in {*known, *(parent for parent, _ in known.values())}:
             if len(self._moving) != 1:
                 self.lacking = (
                     f"{self.topic} moves {', '.join(sorted(self._moving))}, and does not say where "
@@ -363,22 +367,47 @@ class PoseReader:
                 )
                 return []
             (frame,) = self._moving
-        begin, T, passed = frame, np.eye(4), set[str]()
-        while frame not in passed and (frame in self._moving or frame in self._fixed):
-            passed.add(frame)
-            carrier = carrier or (frame if frame in self._moving else "")
-            parent, T_parent_frame = self._moving.get(frame) or self._fixed[frame]
-            frame, T = parent, T_parent_frame @ T
-        self.about = f"{begin} in {frame}"
-        self.lacking = "" if carrier else f"nothing on {self.topic} moves {begin}"
-        if carrier not in stamps:
+        (*path, into), T = self._upwards(frame)
+        carriers = [passed for passed in path if passed in self._moving]
+        if not carriers and (below := self._moving_below(into)):
+            # The sensor is above its odometry's frame.
+            leaf, *others = below
+            if others:
+                self.lacking = (
+                    f"{self.topic} moves {', '.join(sorted(below))} below {into}, so nobody knows "
+                    f"in which of them {frame} moves; let the system publish {frame} below the "
+                    f"frame of its odometry (as KISS-ICP's invert_odom_tf: false)"
+                )
+                return []
+            (*path, _), T_into_leaf = self._upwards(leaf)
+            carriers = [passed for passed in reversed(path) if passed in self._moving]
+            into, T = leaf, invert(T_into_leaf) @ T
+        upside_down = " (the tree is inverted)" * (into in self._moving)
+        self.about = f"{frame} in {into}{upside_down}"
+        self.lacking = "" if carriers else f"nothing on {self.topic} moves {frame}"
+        if not carriers or carriers[0] not in stamps:
             return []
         types, q = self._link.store.types, np.full(4, np.nan)
         if np.isfinite(T).all():
             (q,) = to_quaternions(T[None])
         position = types["geometry_msgs/msg/Vector3"](*T[:3, 3].tolist())
         rotation = types["geometry_msgs/msg/Quaternion"](*q.tolist())
-        return [(stamps[carrier], frame, position, rotation)]
+        return [(stamps[carriers[0]], into, position, rotation)]
+
+    def _upwards(self, frame: str) -> tuple[list[str], Poses]:
+        """A frame and those above it, and its pose in the last of them."""
+        path, T = [frame], np.eye(4)
+        while path[-1] in self._moving or path[-1] in self._fixed:
+            parent, T_parent_frame = self._moving.get(path[-1]) or self._fixed[path[-1]]
+            path, T = [*path, parent], T_parent_frame @ T
+            if parent in path[:-1]:  # a circle
+                break
+        return path, T
+
+    def _moving_below(self, top: str) -> list[str]:
+        """The frames that move below another one, without those that others move with."""
+        parents = {parent for parent, _ in self._moving.values()}
+        return [f for f in self._moving if f not in parents and self._upwards(f)[0][-1] == top]
 
 
 def matrix(p: Any, q: Any) -> Poses:

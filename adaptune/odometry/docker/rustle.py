@@ -131,12 +131,13 @@ class Ros1System(RosSystem):
         words = self._container.last_lines()
         return OdometryError(f"no roscore: {processes.how_it_ended(code)}: {words}")
 
-    def state(self) -> dict[str, Any]:
+    def state(self, fresh: bool = False) -> dict[str, Any]:  # noqa: ARG002
         state: dict[str, Any] = self.link.ask("state", topics=self._topics)
         nodes = state["nodes"].values()
         self.usage = Usage(sum(cpu for cpu, _ in nodes), sum(memory for _, memory in nodes))
         if state["dead"]:
-            raise OdometryError(f"node {state['dead'][0]} died")
+            self.died = f"node {state['dead'][0]} died"
+            raise OdometryError(self.died)
         if (code := self._container.finished(self._launch)) is not None:
             raise OdometryError(f"roslaunch ended with code {code}")
         return state

@@ -14,6 +14,7 @@ from adaptune.commands.tune import say_odometries
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.tuning import asked, tuned
+from adaptune.yaml12 import Document
 from offline.config import load_study
 from offline.train import COST
 
@@ -206,7 +207,7 @@ def test_of_a_launch_command_a_study_is_written_to_fill_in(bag):
     done = commands.succeeded(*given, "ros2 launch kiss_icp odometry.launch.py topic:=/points")
     assert "adaptune inspect one_ros2.yaml" in done.output
     text = Path("one_ros2.yaml").read_text()
-    assert "- odometry.launch.py\n    - topic:=/points\n    - FILL_IN:={parameters}\n" in text
+    assert "- odometry.launch.py\n    - topic:=/points\n    - FILL_IN:={parameters}\n  " in text
     looked = commands.refused("inspect", "one_ros2.yaml")
     lines = [str(n) for n, line in enumerate(text.splitlines(), 1) if "FILL_IN" in line]
     assert len(lines) > 3
@@ -220,8 +221,46 @@ def test_of_a_launch_command_a_study_is_written_to_fill_in(bag):
     config = load_study(Path("one_ros2.yaml"), [], None, needed=False).config
     assert config.odometries["ros2"].settings["points"] == "/points"
     assert "one_ros2.yaml: exists" in failed(*given[1:], "ros2 launch a b")
+    # It is looked for before anything is started, as by the stages.
+    filled = Path("one_ros2.yaml").read_text().replace("- ros2\n", "- ros3\n")
+    Path("one_ros2.yaml").write_text(filled.replace("FILL_IN", "voxel"))
+    words = "a login shell of this machine finds no 'ros3'; source your ROS 2 in ~/.bash_profile"
+    assert words in commands.refused("inspect", "one_ros2.yaml")
     refused = failed(*given[1:], "my/kiss-icp:jazzy")
     assert "there is no image 'my/kiss-icp:jazzy'" in refused or "no Docker engine" in refused
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "points"),
+    [
+        ("ros2 launch a b.launch.py", ["FILL_IN:={parameters}", "FILL_IN:={points}"], "/points"),
+        ("ros2 launch a b.launch.py points_topic:=/vlp f:={parameters}", [], "/vlp"),
+        (
+            "ros2 launch a b.launch.py odom_topic:=/odom",
+            ["FILL_IN:={parameters}", "FILL_IN:={points}"],
+            "/points",
+        ),
+        (
+            "ros2 run a node",
+            ["--ros-args", "--params-file", "{parameters}", "-r", "FILL_IN:={points}"],
+            "/points",
+        ),
+        (
+            "ros2 run a node --ros-args -r cloud:=/os/points",
+            ["--params-file", "{parameters}"],
+            "/os/points",
+        ),
+    ],
+)
+def test_the_study_of_a_system_asks_for_the_topic_of_the_clouds(bag, command, arguments, points):
+    given = ("--points", "/points", "--odometry", command, "--folder", "kept/here")
+    done = commands.succeeded("tune", bag, *given)
+    assert "adaptune inspect kept/here/one_ros2.yaml" in done.output
+    assert "--folder kept/here" in done.output
+    assert not Path("one_ros2.yaml").exists()
+    settings = Document.of_file(Path("kept/here/one_ros2.yaml")).data["odometry"]["settings"]
+    assert settings["command"] == [*command.split(), *arguments]
+    assert settings["points"] == points
 
 
 @pytest.mark.usefixtures("decided")

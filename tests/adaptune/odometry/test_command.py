@@ -9,13 +9,18 @@ import program
 import pytest
 import yaml
 from made_drives import described, trials_of
+from odometry_node import path
 from setups import setup_of
 
 from adaptune.archive import Archive
 from adaptune.errors import OdometryError
 from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.program import CommandSettings, ProgramInput, WholeRun
+from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template
+from adaptune.recording import Scan
 from adaptune.strict import ConfigurationError
+from adaptune.trajectory import Trajectory
 from adaptune.trial_rows import rows
 from offline.campaign import BaselineError
 from offline.config import load_study
@@ -370,3 +375,24 @@ def test_mistakes_in_the_study(make, override, words):
     with pytest.raises(ConfigurationError) as caught:
         make("none", override)
     assert words in str(caught.value)
+
+
+class OfEnds(WholeRun):
+    """Gives poses of the ends of scans, with their stamps."""
+
+    def trajectory(self, given, _):
+        seconds = 1e-9 * (given.stamps - given.stamps[0] + given.span)
+        return Trajectory(given.stamps, path(seconds))
+
+
+@pytest.mark.parametrize(("pose_time", "right"), [("stamp", False), ("end", True)])
+def test_poses_of_the_end_are_carried_back(pose_time, right):
+    stamps = 10**12 + 10**8 * np.arange(30)
+    given = ProgramInput(Path("a.bag"), "/points", "", stamps, None, span=99_000_000)
+    settings = CommandSettings(command=["x"], pose_time=pose_time)
+    odometry = OfEnds({}, settings, Limits(), lambda: given)
+    scans = [odometry.prepare(Scan(int(s), np.zeros((1, 3), np.float32))) for s in stamps]
+    poses = np.array([odometry.start(scans[0], np.eye(4)) or np.eye(4)])
+    found = [odometry.register(scan).T_odom_sensor for scan in scans[1:]]
+    off = np.concatenate([poses, found])[:, :3, 3] - path(1e-9 * (stamps - stamps[0]))[:, :3, 3]
+    assert bool(np.linalg.norm(off, axis=1).max() < 0.03) is right

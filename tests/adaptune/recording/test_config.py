@@ -132,5 +132,9 @@ def test_a_program_reads_the_part_alone(tmp_path):
     for part, own in ((None, True), ("0-60%", False)):
         config = SequenceConfig(bag=str(bag), reference="/poses", part=part)
         folder = tmp_path / "inputs" / str(part)
-        found = program_input(open_sequence(config), config, {}, folder, "bag")
+        sequence = open_sequence(config)
+        found = program_input(sequence, config, {}, folder, "bag")
         assert (found.path == bag) is own
+        # What its poses may be later than its stamps.
+        assert found.span == pytest.approx(1e8, abs=10)
+        assert found.stamps.tolist() == [scan.stamp for scan in sequence]

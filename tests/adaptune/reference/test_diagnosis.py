@@ -312,6 +312,26 @@ def test_scans_that_were_dropped_do_not_count(monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("later", "told"),
+    [(0.1, True), (0.09, True), (0.0, False), (0.05, False), (-0.1, False), (0.2, False)],
+)
+@pytest.mark.parametrize("span", [0.0, 0.1])
+def test_poses_of_the_end_of_scans_are_named(monkeypatch, span, later, told):
+    """Those of another moment, and of scans without times, may be anything."""
+
+    class Timed(Recorded):
+        def __iter__(self):
+            points, times = np.zeros((2, 3), np.float32), np.array([0.0, span], np.float32)
+            return (Scan(int(stamp), points, times) for stamp in SCANS)
+
+    monkeypatch.setattr(diagnosis, "measured_motions", lambda scans, _: [*scans] and hops())
+    T = poses(SCANS + round(later * 1e9))
+    found = list(diagnosis.contradictions(Timed(poses(SCANS)), T, 2.0, None, True))
+    named = any("odometry.settings.pose_time: end" in one.mend for one in found)
+    assert named == (told and span > 0)
+
+
+@pytest.mark.parametrize(
     ("metres", "seconds", "used"), [(0.1, 0.1, 4), (0.2, 0.1, 2), (0.5, 0.1, 1), (0.1, 1.0, 1)]
 )
 def test_of_slow_scans_some_are_enough(monkeypatch, metres, seconds, used):

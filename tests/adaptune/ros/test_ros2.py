@@ -156,11 +156,13 @@ def test_a_refusal_gives_the_reason(link):
         link.set_parameters("/robot/slam", {"bounds": [1]})
 
 
-@pytest.mark.parametrize("node", ["/other", "/deaf"])
-def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, node, domain):
+def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, domain):
     words = f"in ROS domain {domain}; the services there are /deaf/.*, /robot/slam/"
-    with pytest.raises(LinkError, match=f"{node} does not answer: .* {words}"):
-        link.set_parameters(node, {"voxel_size": 1.0})
+    with pytest.raises(LinkError, match=f"/other does not answer: .* {words}"):
+        link.set_parameters("/other", {"voxel_size": 1.0})
+    words = "/deaf does not answer: /deaf/set_parameters .*; it is there, but busy for 2 s or more"
+    with pytest.raises(LinkError, match=words):
+        link.set_parameters("/deaf", {"voxel_size": 1.0})
 
 
 def test_an_error_while_a_message_is_taken_is_logged_and_the_next_one_comes(link, caplog):

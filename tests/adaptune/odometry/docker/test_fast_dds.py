@@ -1,9 +1,11 @@
 """A node on Fast DDS, whose receive buffer is the kernel's."""
 
+import re
 import subprocess
 from itertools import takewhile
 from pathlib import Path
 
+import drives
 import numpy as np
 import pytest
 from contained import LIMITS
@@ -11,7 +13,9 @@ from needs import ROOT, lacking, needs, needs_program
 from ros2_reference import ros2
 
 from adaptune.odometry.docker import lockstep
+from adaptune.odometry.docker.probe import look
 from adaptune.odometry.docker.ros2_system import Ros2
+from adaptune.odometry.program import ProgramInput
 from adaptune.recording import Scan
 from adaptune.ros import relay
 
@@ -35,20 +39,26 @@ def node():
     return str(target)
 
 
+def scans(n_points):
+    points = np.random.default_rng(0).uniform(-9.0, 9.0, (n_points, 3)).astype(np.float32)
+    return [Scan(10**9 + stamp, points) for stamp in range(0, 4 * 10**9, 10**8)]
+
+
 @pytest.fixture
-def drive(node, tmp_path, monkeypatch):
+def settings(node, tmp_path):
+    given = {"image": None, "command": (node, "{parameters}"), "patience": 0.5}
+    return lambda **more: ros2(tmp_path / "icp.yaml", **(given | more))
+
+
+@pytest.fixture
+def drive(settings, monkeypatch):
     monkeypatch.setattr(lockstep, "_MOST_SILENT", 6)
     made = []
 
-    def begin(n_points):
-        settings = ros2(
-            tmp_path / "icp.yaml", image=None, command=(node, "{parameters}"), patience=0.5
-        )
-        odometry = Ros2.instance({}, settings, LIMITS, None)
+    def begin(n_points, read=None, **more):
+        odometry = Ros2.instance({}, settings(**more), LIMITS, read)
         made.append(odometry)
-        points = np.random.default_rng(0).uniform(-9.0, 9.0, (n_points, 3)).astype(np.float32)
-        stamps = range(0, 4 * 10**9, 10**8)
-        first, *others = (Scan(10**9 + stamp, points) for stamp in stamps)
+        first, *others = map(odometry.prepare, scans(n_points))
         odometry.start(first, np.eye(4))
         left = takewhile(lambda _: not odometry.faults, others)
         found = [odometry.register(scan).registered for scan in left]
@@ -72,3 +82,25 @@ def test_larger_ones_are_lost_and_the_line_that_cures_it_is_told(drive):
     (fault,) = odometry.faults
     assert "a node runs on Fast DDS, which loses clouds that do not fit in the receive" in fault
     assert CURE in fault
+
+
+@pytest.mark.skipif(relay.receives_clouds(), reason="this machine's buffers hold clouds")
+def test_where_it_is_looked_at_the_same_line_is_told(settings):
+    found = look(settings(), {}, LIMITS, scans(29_000)[:12])
+    assert CURE in found["lockstep"]
+    assert "play: bag" not in found["lockstep"]
+
+
+@pytest.mark.skipif(relay.receives_clouds(), reason="this machine's buffers hold clouds")
+def test_of_a_bag_each_error_tells_it_and_counts_the_same_scans(drive, tmp_path, caplog):
+    every = scans(29_000)
+    bag = drives.write_bag(tmp_path / "a.bag", [(s.stamp, s.points, np.eye(4)) for s in every])
+    stamps = np.array([scan.stamp for scan in every], np.int64)
+    given = ProgramInput(bag, "/points", "", stamps, None)
+    odometry, _ = drive(29_000, lambda: given, play="bag", rate=1.0)
+    (fault,) = odometry.faults
+    assert CURE in fault
+    (lacking,) = re.findall(r"(\d+) of 40 scans have no pose at rate 1", caplog.text)
+    assert f"it gave poses for {40 - int(lacking)} of 40 scans; the first pose" in fault
+    own = odometry._T_own_sensor
+    assert sum(np.isnan(T).any() for T in own.values()) == int(lacking)

@@ -84,6 +84,35 @@ def test_the_only_frame_that_moves_counts(heard):
     )
 
 
+@pytest.mark.parametrize(
+    ("fixed", "transforms"),
+    [
+        ((), [("lidar", "odom", invert(ODOM_BASE @ BASE_LIDAR))]),
+        ([("base", "lidar", BASE_LIDAR)], [("base", "odom", invert(ODOM_BASE))]),
+        ([("lidar", "base", invert(BASE_LIDAR))], [("base", "odom", invert(ODOM_BASE))]),
+        (
+            [("base", "lidar", BASE_LIDAR)],
+            [("base", "step", moved(1.0, 0.0)), ("step", "odom", moved(-1.0, 0.0))],
+        ),
+    ],
+)
+def test_an_inverted_tree_is_turned_round(heard, fixed, transforms):
+    link, found, reader = heard()
+    link.publish("/tf_static", *((0, *of) for of in fixed))
+    link.publish("/tf", *((6, *of) for of in transforms))
+    ((stamp, frame, p, q),) = found
+    expected = ODOM_BASE if len(transforms) == 1 else np.eye(4)
+    assert (stamp, frame) == (6, "odom")
+    np.testing.assert_allclose(matrix(p, q), expected @ BASE_LIDAR, atol=1e-9)
+    assert reader.about == "lidar in odom (the tree is inverted)"
+    assert not reader.lacking
+    # Of two, nobody knows which is the odometry's.
+    link.publish("/tf", (7, transforms[0][0], "wheel", moved(0.0, 9.0)))
+    assert len(found) == 1
+    assert "moves odom, wheel below" in reader.lacking
+    assert "let the system publish lidar below the frame of its odometry" in reader.lacking
+
+
 def test_frames_that_do_not_move_and_circles_have_no_pose(heard):
     link, found, reader = heard()
     link.publish("/tf_static", (0, "base", "lidar", BASE_LIDAR))
