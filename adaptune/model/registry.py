@@ -59,9 +59,8 @@ def selected(
     found: Selection = asked(rule.select, feature, live)
     sound = isinstance(found, Selection) and found.trial in sets
     sound = sound and found.parameters == sets[found.trial]
-    if not sound or not (
-        None in (found.weights, members) or {*(found.weights or ())} == {*members}
-    ):
+    weighs = {*(found.weights or ())} if sound and members is not None else set()
+    if not sound or (weighs and weighs != {*members}):
         what = f"{rule.select.__qualname__}: returns {shorten(repr(found), 120)}"
         raise RuleError(f"{what}; return Selection(trial, data.sets[trial])")
     return found
