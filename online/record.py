@@ -147,7 +147,9 @@ class StoredReplay:
             weights = _weights(columns.pop("weights"))
             selections = {name: _floats(columns.pop(name)) for name in _NUMBERS}
             # Another version of adaptune may have written further columns.
-            names = load_space(summary.inputs["odometry"]["parameters"]).names
+            if (about := summary.inputs.get("odometry")) is not None:
+                names = load_space(about["parameters"]).names
+                columns = {name: columns[name] for name in names if name in columns}
         except (OSError, KeyError, ValueError) as error:
             raise damaged(path, error) from error
         if {len(frames[name]) for name in FRAME_COLUMNS[1:-1]} != {len(trajectory)}:
@@ -157,7 +159,7 @@ class StoredReplay:
             kept = summary.inputs["parameters"] or {}
             columns = {name: [str(value)] for name, value in kept.items()}
             stamps, selections = trajectory.stamps[:1], dict.fromkeys(_NUMBERS, np.full(1, np.nan))
-        choices = {name: _numbers(columns[name]) for name in names if name in columns}
+        choices = {name: _numbers(values) for name, values in columns.items()}
         return cls(summary, trajectory, frames, stamps, choices, weights, selections)
 
 

@@ -274,7 +274,7 @@ def test_python_works():
             exec(compile(quicker, page, "exec"), names)
         if "adaptune.tune(" in code:
             assert {"trial", "keyframe_interval", "mean"} <= set(names["tuned"].trials)
-            assert repr(names["tuned"]).endswith(" More: runs/hall/report/report.html>")
+            assert repr(names["tuned"]).endswith("/runs/hall/report/report.html>")
         if "read_scenario" in code:
             assert names["errors"].score(FixedSet()).mean() > 0.0
             shown = {key: repr(names[key]) for key in ("study", "trained")}

@@ -50,7 +50,8 @@ def test_two_writers_do_not_meet(tmp_path):
 
 
 LEAVES = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background ignores it
 from adaptune.files import make_temporary
 folder = make_temporary()
 (folder / "link").touch()

@@ -128,7 +128,8 @@ def test_a_bank_has_the_weights_that_its_rule_gives(monkeypatch):
 
     def weigh(*_):
         weights = left.pop(0) if left else (1.0, 0.0)
-        return Selection(3, {}, dict(zip((3, 5), weights, strict=True)), 0.2, 1.0, 1.0)
+        of_members = dict(zip((3, 5), weights, strict=True))
+        return Selection(3, SETS[3], of_members, 0.2, 1.0, 1.0)
 
     monkeypatch.setattr(BankRule, "weigh", weigh)
     selector = Selector(model)

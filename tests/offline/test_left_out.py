@@ -68,7 +68,8 @@ def test_a_selection_holds_for_its_second(monkeypatch):
     class Remember(Cheat):
         def select(self, feature, live=NOTHING):  # noqa: ARG002
             asked.append(feature)
-            return Selection(TRIALS[len(asked) % 2], {})
+            trial = TRIALS[len(asked) % 2]
+            return Selection(trial, SETS[trial])
 
     sequences = two_kinds(np.random.default_rng(2))[:2]
     monkeypatch.setattr(validation, "rule_class", lambda _: Remember)

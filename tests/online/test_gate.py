@@ -16,7 +16,8 @@ BLOCK = 10
 def paired(i, *, ratio=1.0, restarts=(0, 0), lost=(0, 0), recording=None, seed=0):
     rng = np.random.default_rng((seed, i))
     errors = np.exp(0.2 * rng.normal(size=(2, 200))) * [[ratio], [1.0]]
-    named = SimpleNamespace(name=f"drive_{i}")
+    summary = SimpleNamespace(scans=200, lacking=0)
+    named = SimpleNamespace(name=f"drive_{i}", summary=summary)
     pair = Pair(errors, BLOCK, recording or f"content {i}")
     return Paired((named, named), pair, np.arange(200.0), restarts, lost)
 

@@ -3,6 +3,7 @@
 import re
 import resource
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import drives
 import numpy as np
@@ -63,8 +64,9 @@ def selections():
 
 
 @pytest.fixture
-def study(study_file, tmp_path):
-    """A study with replays that were made up."""
+def study(study_file, tmp_path, monkeypatch):
+    """A study with replays that were made up, of parameters that its odometry does not have."""
+    monkeypatch.setattr("online.record.load_space", lambda _: SimpleNamespace(names=tuple(FIXED)))
     study = load_study(study_file, [], tmp_path / "run")
     folder = study.folder / "replays/three"
     shared = study.replay_inputs("three")

@@ -457,4 +457,4 @@ def test_what_is_new_goes_where_its_folder_belongs(tmp_path):
     assert (study.training, study.test) == (("park", "street"), ("yard", "alley"))
     text = path.read_text()
     assert text.startswith("# mine\n")
-    assert "# a robot's\nhealth:\n  # m/s: twice" in text
+    assert "health:  # a robot's\n  # m/s: twice" in text

@@ -301,7 +301,7 @@ def test_with_the_baseline_s_parameters_something_else_than_these_is_wrong(make)
 def test_poses_without_stamps_that_are_too_many_or_not_rigid(make):
     kitti = ["odometry.settings.output=run.txt", "odometry.settings.format=kitti"]
     for fault, more, told in (
-        ("not rigid", [], "pose 4: that is not rigid"),
+        ("not rigid", [], "run.txt, line 4: its numbers are no rigid pose"),
         ("half", [], "20 of 40 scans"),
         ("pretend", ["sequences.one.stop=2.0"], "40 poses without stamps for 20 scans"),
     ):

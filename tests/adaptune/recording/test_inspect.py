@@ -9,7 +9,8 @@ from rosbags.highlevel import AnyReader
 from small_bag import START, bad_cloud, cloud, drive, entry, inspection_text, pose, texts
 
 from adaptune import yaml12
-from adaptune.recording import SequenceConfig, SequenceError
+from adaptune.errors import AdaptuneError
+from adaptune.recording import SequenceConfig
 from adaptune.recording import inspect as module
 from adaptune.recording import recording as module_recording
 from adaptune.recording.inspect import inspect
@@ -266,12 +267,12 @@ def test_files_that_are_no_recording_are_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     for path, message in [
         (tmp_path / "none.bag", "there is no such file or folder"),
-        (tmp_path / "a.yaml", "not a bag"),
+        (tmp_path / "a.yaml", "holds XML, JSON or NMEA"),
         (tmp_path / "empty", r"holds no scan \(.*\) and no bag"),
         (tmp_path / "a.bag", "is no bag, whatever"),
         (tmp_path / "a.mcap", "is no bag, whatever"),
     ]:
-        with pytest.raises(SequenceError, match=message):
+        with pytest.raises(AdaptuneError, match=message):
             inspect(path)
 
 

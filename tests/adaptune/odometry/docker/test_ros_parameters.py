@@ -47,7 +47,8 @@ def test_a_value_of_many_names(tmp_path):
     assert held.path_of("d") == ("d",)
     assert held.path_of("b.d") == ("b", "d")
     path.write_text("a: {x: 1}\nb: {x: 1}\n")
-    with pytest.raises(OdometryError, match=r"'x' may be any of a\.x, b\.x; name one of them"):
+    several = r"'x' may be any of a\.x \(line 1\), b\.x \(line 2\); name one of them"
+    with pytest.raises(OdometryError, match=several):
         Template(path).path_of("x")
 
 
