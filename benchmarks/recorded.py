@@ -216,15 +216,11 @@ def summary(ratios: Mapping[str, Sequence[float]]) -> list[str]:
 
 
 RECORDINGS = {
-    **dict.fromkeys(CARS, 25.0),
-    "campus": 25.0,
-    "nuscenes_0006_keyframes": 25.0,
-    "livox_hku_1: 0-50%": 10.0,
-    "livox_hku_2: 0-50%": 10.0,
-    "hall": 5.0,
+    **dict.fromkeys((*CARS, "campus", "nuscenes_0006_keyframes"), 10.0),
+    **dict.fromkeys(("livox_hku_1", "livox_hku_2", "hall"), 5.0),
 }
 """Recordings for `--fixed`, or parts of them, and the metres of their sub-trajectories."""
-ALIKE = [CARS, ("livox_hku_1: 0-50%", "livox_hku_2: 0-50%")]
+ALIKE = [CARS, ("livox_hku_1", "livox_hku_2")]
 """Recordings of one sensor on one kind of robot."""
 
 

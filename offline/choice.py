@@ -18,7 +18,7 @@ PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
 SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
-STANDARD_ERRORS = 2.0
+STANDARD_ERRORS = 1.0
 """Of the logarithm of the ratio to the baseline's error, from its mean to the bound."""
 ONE_BLOCK = 0.3
 """Standard error of that logarithm where there is one block."""

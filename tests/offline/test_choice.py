@@ -59,17 +59,17 @@ def test_cheapness_earns_nothing():
 
 
 def test_what_may_be_chance_is_not_chosen():
-    errors = noisy([1.0, 0.9], 8, spread=0.3)
+    errors = noisy([1.0, 0.97], 8, spread=0.5)
     assert choose(blocks(errors)) == 0
     assert choose(blocks(noisy([1.0, 0.9], 100, spread=0.05))) == 1
     # One block has a standard error, too: of 0.3.
-    assert choose(blocks([[1.0, 0.6]])) == 0
+    assert choose(blocks([[1.0, 0.8]])) == 0
     assert choose(blocks([[1.0, 0.4]])) == 1
 
 
 def test_recordings_that_disagree_are_doubted():
     errors, places = np.ones((24, 2)), np.repeat([0, 1, 2], 8)
-    errors[:, 1] = np.repeat([0.3, 0.9, 1.0], 8)
+    errors[:, 1] = np.repeat([0.3, 1.05, 1.05], 8)
     assert choose(blocks(errors)) == 1
     assert choose(blocks(errors, sequence=places)) == 0
     assert bounds(blocks(errors, sequence=places))[1] > bounds(blocks(errors))[1]
