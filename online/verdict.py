@@ -94,8 +94,15 @@ def verdict(
     where = f"RTE over {length:g} m, {_where(rows)}{judge}"
     own = next((row for row in front if row["trial"] is not None and row["recommended"]), None)
     base = last.get(BASELINE)
-    said = [f"{_drive(best, base, own)}, {where}{_sure(best, base, front)}."]
-    said += _instead(best, last, recommended, own)
+    if best is base or (best.mode == FIXED and own is not None and own["trial"] == 0):
+        said = [f"Keep {CALLED[BASELINE]}: {error_and_cost(best)}, {where}."]
+        said += _why_kept(best, last, recommended)
+    else:
+        trial = f" (trial {own['trial']})" if best.mode == FIXED and own is not None else ""
+        what = f"Drive {called(best.mode)}{trial}: {error_and_cost(best)}"
+        if base is not None:
+            what += f" instead of {error_and_cost(base)} with {CALLED[BASELINE]}"
+        said = [f"{what}, {where}{_sure(best, base, front)}."]
     said += _bought(best, front)
     main = last.get("adaptive")
     if main is not None and main is not best:
@@ -107,30 +114,13 @@ def verdict(
     return [*said, *_other_rules(best, last)]
 
 
-def _drive(best: ComparisonRow, base: ComparisonRow | None, own: Mapping[str, Any] | None) -> str:
-    """What to drive, and its error and cost beside the baseline's."""
-    what = called(best.mode)
-    if best.mode == FIXED and own is not None:
-        what += f" (trial {own['trial']})" if own["trial"] else ", which is the odometry's own"
-    said = f"Drive {what}: " if best is not base and not _is(own, 0, best) else ""
-    said = said or f"Keep {CALLED[BASELINE]}: "
-    said += error_and_cost(best)
-    if base is None or best is base or _is(own, 0, best):
-        return said
-    return f"{said} instead of {error_and_cost(base)} with {CALLED[BASELINE]}"
-
-
-def _is(own: Mapping[str, Any] | None, trial: int, best: ComparisonRow) -> bool:
-    return best.mode == FIXED and own is not None and own["trial"] == trial
-
-
 def _sure(
     best: ComparisonRow, base: ComparisonRow | None, front: Sequence[Mapping[str, Any]]
 ) -> str:
     """How sure the ratio to the baseline is, and what to expect on another drive."""
-    if base is None or best is base or abs(_to_baseline(best).value - 1.0) < ROUNDING:
-        return ""
     ratio = _to_baseline(best)
+    if base is None or abs(ratio.value - 1.0) < ROUNDING:
+        return ""
     said = f": {ratio.value:.2f} times its error ({_interval(ratio)})"
     for row in front:
         if row["recommended"]:
@@ -138,21 +128,14 @@ def _sure(
     return said
 
 
-def _instead(
-    best: ComparisonRow,
-    last: Mapping[str, ComparisonRow],
-    recommended: str,
-    own: Mapping[str, Any] | None,
+def _why_kept(
+    best: ComparisonRow, last: Mapping[str, ComparisonRow], recommended: str
 ) -> list[str]:
     """Why the odometry's own parameters are kept."""
-    if best.mode not in (BASELINE, FIXED) or not (best.mode == BASELINE or _is(own, 0, best)):
-        return []
     other = last.get(recommended)
-    if other is None or _is(own, 0, other):
+    if other is None or other is best or abs(_to_baseline(other).value - 1.0) < ROUNDING:
         return ["In training, no set within the budget was safely better."] * (FIXED in last)
     ratio = _to_baseline(other)
-    if abs(ratio.value - 1.0) < ROUNDING:
-        return ["In training, no set within the budget was safely better."]
     return [
         f"{called(recommended).capitalize()}, which training recommends, is surely worse here: "
         f"{ratio.value:.2f} times its error ({_interval(ratio)})."
