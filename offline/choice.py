@@ -18,8 +18,9 @@ PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
 SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
-STANDARD_ERRORS = 1.0
-"""Of the logarithm of the ratio to the baseline's error, from its mean to the bound."""
+ONE_RECORDING = 2.0
+"""Standard errors from the mean logarithm to the bound where there is one recording, whose blocks
+say little of other drives; of several recordings, one."""
 ONE_BLOCK = 0.3
 """Standard error of that logarithm where there is one block."""
 FLOOR = 0.05
@@ -156,22 +157,24 @@ def surely_restarted(blocks: BlockErrors) -> NDArray[np.bool_]:
 def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
     """Upper bound of the ratio of each set's error to the baseline's, of shape (n_trials,).
 
-    It is the geometric mean over blocks, and `STANDARD_ERRORS` above. Recordings count the same,
-    and may differ: of several, the standard error is theirs, unless that of blocks is larger. It is
-    infinite for sets that are not admissible: they failed, were surely restarted more often than
+    It is the geometric mean over blocks, and a standard error above. Recordings count the same, and
+    may differ: of several, the standard error is theirs, unless that of blocks is larger; of one,
+    see `ONE_RECORDING`. It is infinite for sets that are not admissible: they failed, were surely restarted more often than
     the baseline (whoever takes their parameters elsewhere has no health check), or are surely
     worse, also in rotation.
     """
     mean, error = mean_and_error(logs := blocks.logs(), blocks.sequence)
     error[~np.isfinite(error)] = ONE_BLOCK
     numbers = np.unique(blocks.sequence)
-    if len(numbers) > 1:
+    if len(numbers) == 1:
+        error *= ONE_RECORDING
+    else:
         means = np.array([logs[blocks.sequence == s].mean(axis=0) for s in numbers])
         with np.errstate(invalid="ignore"):
             error = np.fmax(error, means.std(axis=0, ddof=1) / np.sqrt(len(numbers)))
     error[blocks.baseline] = 0.0
     with np.errstate(invalid="ignore", over="ignore"):
-        bound = np.exp(mean + STANDARD_ERRORS * error)
+        bound = np.exp(mean + error)
     usable = np.isfinite(bound) & ~surely_restarted(blocks) & ~surely_worse(blocks)
     if blocks.turns is not None:
         usable &= ~surely_worse(blocks._replace(errors=blocks.turns))

@@ -63,7 +63,7 @@ def test_what_may_be_chance_is_not_chosen():
     assert choose(blocks(errors)) == 0
     assert choose(blocks(noisy([1.0, 0.9], 100, spread=0.05))) == 1
     # One block has a standard error, too: of 0.3.
-    assert choose(blocks([[1.0, 0.8]])) == 0
+    assert choose(blocks([[1.0, 0.6]])) == 0
     assert choose(blocks([[1.0, 0.4]])) == 1
 
 
@@ -73,6 +73,10 @@ def test_recordings_that_disagree_are_doubted():
     assert choose(blocks(errors)) == 1
     assert choose(blocks(errors, sequence=places)) == 0
     assert bounds(blocks(errors, sequence=places))[1] > bounds(blocks(errors))[1]
+    # Several that agree say more than one that is as long.
+    errors = np.repeat([[1.0, 0.8], [1.0, 1.1]], 12, axis=0)[np.tile([0, 12], 12)]
+    assert choose(blocks(errors)) == 0
+    assert choose(blocks(errors, sequence=places)) == 1
 
 
 def test_a_budget_below_the_baseline_may_take_what_is_worse():
