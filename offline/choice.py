@@ -159,9 +159,9 @@ def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
 
     It is the geometric mean over blocks, and a standard error above. Recordings count the same, and
     may differ: of several, the standard error is theirs, unless that of blocks is larger; of one,
-    see `ONE_RECORDING`. It is infinite for sets that are not admissible: they failed, were surely restarted more often than
-    the baseline (whoever takes their parameters elsewhere has no health check), or are surely
-    worse, also in rotation.
+    see `ONE_RECORDING`. It is infinite for sets that are not admissible: they failed, were surely
+    restarted more often than the baseline (whoever takes their parameters elsewhere has no health
+    check), or are surely worse, also in rotation.
     """
     mean, error = mean_and_error(logs := blocks.logs(), blocks.sequence)
     error[~np.isfinite(error)] = ONE_BLOCK

@@ -59,14 +59,18 @@ def show_table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "")
     console.print(*tables_within(Listing(title, rows, caption), console.width), sep="\n")
 
 
+_ORDER = "own parameters, within the budget, no more CPU time, just below the budget, any CPU time"
+"""What a row of the front is called that is several of these."""
+
+
 def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> None:
     """The table of what CPU time buys."""
     shown = [
         {
-            "": ("-> " if row["recommended"] else "") + row["what"],
+            "": "-> " * row["recommended"] + min(row["what"].split(", "), key=_ORDER.find),
             **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
             "RTE [%]": row["error [%]"],
-            "on another drive": row["vs baseline"],
+            "elsewhere": row["vs baseline"],
             "95 %": None
             if row["low"] is None or row["low"] != row["low"]
             else f"{row['low']:.2f}-{row['high']:.2f}",
@@ -81,8 +85,8 @@ BUYS = (
     "What CPU time buys, in training",
     "The arrow marks what is recommended: the least bound of the error within the budget (twice "
     "what the odometry's own parameters take, unless --budget says otherwise). RTE is of whole "
-    "drives, capped where track is lost; a bank's is of parts left out of training. On another "
-    "drive: the ratio to expect there, and its 95 % interval.",
+    "drives, capped where track is lost; a bank's is of parts left out of training. Elsewhere: the "
+    "ratio to the baseline's to expect on another drive, and its 95 % interval.",
 )
 
 

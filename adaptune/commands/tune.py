@@ -1,6 +1,7 @@
 """Commands that begin with recordings: look at one, or tune an odometry on them."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -132,9 +133,14 @@ def _look(path: Path) -> bool:
     from adaptune.odometry.registry import ROS_SYSTEMS
     from adaptune.trajectory import is_kitti
     from adaptune.tuning.studies import LACKING
+    from adaptune.yaml12 import Document, YamlError
 
     if path.is_file():
-        is_kitti(path)  # poses as YAML are refused
+        given: Any = None
+        with suppress(YamlError):
+            given = Document.of_file(path).data
+        if not isinstance(given, dict) or "odometry" not in given:
+            is_kitti(path)  # poses as YAML are refused
     loaded = load(path, [], None)
     factory: Any = loaded.odometry
     if loaded.config.odometries.keys().isdisjoint(ROS_SYSTEMS) or len(loaded.config.odometries) > 1:

@@ -380,7 +380,8 @@ def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
     assert json.loads((bank / "replay.json").read_text())["restarts"] == 0
     checked = []
     monkeypatch.setattr(probe, "check_live", lambda odometry, _: checked.append(odometry.name))
-    live = commands.call("online", "icp_study.yaml", "-o", "online.switching.mechanism=live")
+    one = ["-o", "online.switching.mechanism=live", "-o", "online.modes=[standby]"]
+    live = commands.call("online", "icp_study.yaml", *one)
     assert live.exit_code == 0, live.output
     assert checked == ["ros2"]
     assert not containers()
