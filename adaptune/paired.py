@@ -99,17 +99,9 @@ def of_stretches(logs: NDArray[np.float64], recordings: Sequence[str]) -> Ratio:
 
     A unit of evidence is a recording where there are `MIN_RECORDINGS`, else a stretch.
     """
-    from scipy.special import stdtrit  # slow to import
-
-    _, place = np.unique(np.asarray(recordings), return_inverse=True)
-    units, mean = logs, float(logs.mean())
-    if place.max() + 1 >= MIN_RECORDINGS:
-        units = np.bincount(place, logs) * (place.max() + 1) / len(logs)
-    if len(units) < 2:
-        return Ratio(math.exp(mean))
-    error = float(units.std(ddof=1)) / math.sqrt(len(units))
-    margin = min(error * float(stdtrit(len(units) - 1, 0.975)), 700.0)
-    return Ratio(math.exp(mean), (math.exp(mean - margin), math.exp(mean + margin)), error)
+    n = len(logs)
+    spread = float(logs.std(ddof=1)) if n > 1 else math.inf
+    return pooled(logs, np.full(n, spread), np.full(n, (n - 1.0) / n), recordings)
 
 
 def interval_of_mean(errors: NDArray[np.float64], block: int, own: float | None) -> Interval:

@@ -228,8 +228,8 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     Returns shape (n_trials,).
     """
     base = max(float(blocks.costs[blocks.baseline]), LEAST_COST)
-    most = EDGE * USUAL_BUDGET * base if budget is None else max(budget, LEAST_COST)
-    few = ~(blocks.costs > min(most, max(MOST_OF_PERIOD * blocks.period, base)) + ROUNDING)
+    most = min(allowed_cost(budget, base), max(MOST_OF_PERIOD * blocks.period, base))
+    few = ~(blocks.costs > most + ROUNDING)
     if not few.any():
         cheapest = int(np.argmin(blocks.costs))
         raise AdaptuneError(
@@ -239,6 +239,11 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
             f"fewer iterations, another odometry)"
         )
     return np.asarray(few)
+
+
+def allowed_cost(budget: float | None, base: float) -> float:
+    """Milliseconds of CPU time a scan that a set may cost, where the baseline's is `base`."""
+    return EDGE * USUAL_BUDGET * base if budget is None else max(budget, LEAST_COST)
 
 
 class Front(NamedTuple):

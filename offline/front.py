@@ -16,10 +16,9 @@ from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
 from adaptune.space import in_words
 from offline.choice import (
-    EDGE,
     MOST_OF_PERIOD,
-    USUAL_BUDGET,
     Elsewhere,
+    allowed_cost,
     bounds,
     elsewhere,
     mean_and_error,
@@ -142,6 +141,6 @@ def recommended(
 
     Budget and the time from scan to scan are in milliseconds. Where there is none, the cheapest.
     """
-    most = EDGE * USUAL_BUDGET * own_cost(rows) if budget is None else budget
+    most = allowed_cost(budget, own_cost(rows))
     few = [r for r in rows if r[COST] <= most and r["99 % [ms]"] <= MOST_OF_PERIOD * period]
     return min(few or rows, key=lambda row: row["bound"] if few else row[COST])

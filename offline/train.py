@@ -23,7 +23,6 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import EQUAL_COST
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -212,7 +211,7 @@ def write_sets(
     write_text(study.folder / FIXED_SET, yaml12.dump(fixed))
     if own is not None:
         write_text(own[0], own[1].text)
-    path = study.folder / f"{EQUAL_COST}.yaml"
+    path = study.folder / "equal_cost.yaml"
     if equal_cost is not None and equal_cost != fixed:
         write_text(path, yaml12.dump(equal_cost))
     else:

@@ -16,7 +16,7 @@ from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary
 from adaptune.model.weights import bank_weights, choose_members
 from adaptune.paired import of_stretches
-from offline.choice import EDGE, USUAL_BUDGET
+from offline.choice import allowed_cost
 from offline.labelled import LabelledData, LabelledSequence, periods
 
 if TYPE_CHECKING:
@@ -255,6 +255,6 @@ def recommends_bank(data: LabelledData, chosen: Policy, fixed: int) -> bool:
     if chosen.expected is None or len(chosen.members) < 2 or not chosen.expected.loss < -ROUNDING:
         return False
     blocks = data.driven_blocks()
-    most = data.budget or USUAL_BUDGET * EDGE * float(blocks.costs[blocks.baseline])
+    most = allowed_cost(data.budget, float(blocks.costs[blocks.baseline]))
     restarts = blocks.restarts[list(blocks.trials).index(fixed)]
     return data.costs.adaptive(chosen.members) <= most or bool(restarts > 0.0)

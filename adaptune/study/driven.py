@@ -16,10 +16,6 @@ PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
 
 
-EQUAL_COST = "equal_cost"
-"""Name of the file of the best set that costs no more than the baseline."""
-
-
 class ModeError(AdaptuneError):
     """A mode that the model does not allow."""
 
