@@ -51,11 +51,9 @@ def stretches_along(name: str, frames: Frames) -> list[Stretch]:
 STRETCH, OVERHANG = 2.0, 1.0
 """Sub-trajectories that begin along a stretch, and that it is longer than that."""
 WARM_UP = 20.0, 6.0
-"""Metres and seconds that do not count at the begin of a stretch: an odometry has no map yet."""
+"""Metres and seconds that do not count where a stretch begins within a recording, without a map."""
 MOST_DRIVEN = 0.7
 """Share of a recording above which all of it is driven."""
-STANDING = 0.5
-"""Metres a second below which a robot stands: where a recording begins so, no warm-up is needed."""
 
 
 def stretches_of(
@@ -66,7 +64,7 @@ def stretches_of(
     Returns shape (k, 3), see `Frames.stretches`.
     """
     metres, seconds = travelled(T_ref_sensor), (stamps - stamps[0]) * 1e-9
-    whole = np.array([[0, _settled(metres, seconds), len(stamps)]], np.intp)
+    whole = np.array([[0, 0, len(stamps)]], np.intp)
     size = (STRETCH + OVERHANG) * length
     if n is None or n * size > metres[-1]:
         return whole
@@ -75,7 +73,7 @@ def stretches_of(
         return np.maximum(np.searchsorted(of, until, side="right") - 1, 0)
 
     # Where the robot stands, the last scan before it moves.
-    begins = last(metres, np.linspace(metres[whole[0, 1]], metres[-1] - 1.01 * size, n))
+    begins = last(metres, np.linspace(0.0, metres[-1] - 1.01 * size, n))
     ends = last(metres, metres[begins] + size) + 2
     warm = np.minimum(
         last(metres, np.maximum(metres[begins] - WARM_UP[0], 0.0)),
@@ -87,12 +85,3 @@ def stretches_of(
         return whole
     known = window_ends(T_ref_sensor, length) >= 0
     return found[[bool(known[begin:end].any()) for _, begin, end in found]]
-
-
-def _settled(metres: NDArray[np.float64], seconds: NDArray[np.float64]) -> int:
-    """First scan that counts where a recording may begin in motion."""
-    if metres[np.searchsorted(seconds, 1.0, side="right") - 1] < STANDING:
-        return 0
-    far = np.searchsorted(metres, min(WARM_UP[0], metres[-1] / 5.0))
-    late = np.searchsorted(seconds, min(WARM_UP[1], seconds[-1] / 5.0))
-    return int(min(far, late))
