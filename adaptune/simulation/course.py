@@ -143,6 +143,7 @@ class Course(StrictModel):
     seed: int = Field(0, ge=0, lt=2**31)  # of the world, the drive and the noise
     rate: float | None = Field(None, gt=0.0, le=100.0)  # turns a second, in place of the sensor's
     columns: int | None = Field(None, ge=16, le=8192)  # firings a turn, in place of the sensor's
+    stride: int = Field(1, ge=1, le=1000)  # keeps every stride-th scan
     # Seconds at rest before it drives off, which LiDAR-inertial systems need to begin.
     standstill: float = Field(0.0, ge=0.0, le=60.0)
     imu: Literal[200, 400] | None = None  # Hz of the inertial measurements, if there are any

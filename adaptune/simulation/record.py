@@ -59,11 +59,11 @@ class SimulatedDrive:
         self.ride = Ride(self.road, motion, course.seed, course.standstill)
 
     def __len__(self) -> int:
-        """Whole scans in the drive."""
+        """Turns of the sensor in the drive; `Course.stride` says which are kept."""
         return int(self.ride.duration * self.course.turns)
 
     def stamps(self) -> NDArray[np.int64]:
-        """Borders of the scans in nanoseconds, one more than there are scans."""
+        """Borders of the turns in nanoseconds, one more than there are turns."""
         borders = np.arange(len(self) + 1) * (1e9 / self.course.turns)
         return np.asarray(EPOCH + np.rint(borders).astype(np.int64))
 
@@ -82,7 +82,8 @@ class SimulatedDrive:
         times = np.repeat(offsets, n_rings).astype(np.float32)
         receiver = (*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
-        for number, stamp in enumerate(self.stamps()[:-1].tolist()):
+        turns = list(enumerate(self.stamps()[:-1].tolist()))
+        for number, stamp in turns[:: course.stride]:
             start = (stamp - EPOCH) * 1e-9
             T_world_sensor = self.ride.poses(start + offsets)
             cast = caster.cast(looks, T_world_sensor)
@@ -230,9 +231,13 @@ def _messages(
         return POSES, stamp, types["PoseStamped"](header=header, pose=pose)
 
     def seen() -> Iterator[Message]:
-        for i, scan in enumerate(drive.scans()):
+        scans = drive.scans()
+        for i in range(len(drive)):
             yield pose(i + 1)
-            end, cloud = int(stamps[i + 1]), structured(scan)
+            if i % course.stride:
+                continue
+            scan, end = next(scans), int(stamps[i + 1])
+            cloud = structured(scan)
             if at_end := course.stamp == "end":
                 cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
             header = ros.header(POINTS, end if at_end else scan.stamp, "velodyne")

@@ -113,3 +113,12 @@ def test_nothing_is_left_of_an_interrupted_recording(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         record(COURSE, tmp_path / "run.bag", progress=interrupt)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_of_a_stride_every_so_many_th_scan_is_there(tmp_path, scans):
+    path = tmp_path / "run.bag"
+    record(COURSE.model_copy(update={"stride": 4}), path)
+    kept = read(path, "/velodyne_points")
+    assert [stamp_ns(message.header) for _, message in kept] == [s.stamp for s in scans[::4]]
+    assert [len(message.data) for _, message in kept] == [22 * len(s) for s in scans[::4]]
+    assert len(read(path, "/gt_poses")) == len(scans) + 1
