@@ -1,22 +1,25 @@
 """Somebody else's odometry node, of which only parameters are set."""
 
 import logging
+import math
 import subprocess
 import threading
+import time
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
-from adaptune.errors import OdometryError, warn_once
+from adaptune.errors import AdaptuneError, OdometryError, warn_once
 from adaptune.geometry import Poses, invert, to_pose
 from adaptune.odometry.base import OdometryInstance, Registration
 from adaptune.recording.pose_messages import POSES
 from adaptune.recording.scan import Scan
-from adaptune.ros.link import LinkError, RosLink
+from adaptune.ros.link import BusyError, LinkError, RosLink
 from adaptune.ros.steering import Steering
 from adaptune.selector import BACK
-from adaptune.space import Selection
+from adaptune.space import ParameterSet, Selection
 from adaptune.study.config import SteerConfig
 from adaptune.trajectory import Trajectory
 
@@ -29,6 +32,8 @@ _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
 KEPT = 1000
 """Poses of a node, and scans of a drive, that are kept."""
+_BUSY = 2.0
+"""Seconds without an answer; then the log says so."""
 _GAP = 1.0
 """Seconds between poses over which a pose is interpolated."""
 
@@ -49,13 +54,22 @@ class SteeredNode(OdometryInstance):
         self._T_odom_node: Poses | None = None
         self._steering = Steering(
             settings.node,
-            lambda parameters: link.set_parameters(settings.node, parameters),
+            lambda parameters: link.set_parameters(
+                settings.node, parameters, lambda: self._asked != self._newest
+            ),
             settings.command,
             _run,
         )
         self._silent: deque[bool] = deque(maxlen=SILENT)
         self._missed: deque[int] = deque(maxlen=KEPT)  # stamps of scans without a pose in time
         self._warned = False
+        # Only a thread of its own waits for a node that is busy.
+        self._asking, self._verdict = ThreadPoolExecutor(1), Future[None]()
+        self._wanted: ParameterSet | None = None
+        self._newest = self._asked = 0
+        self._unread = 0  # answers to what is no longer asked for, which may come
+        # Since when the node owes an answer, whether that was told, and what it confirmed before.
+        self._since, self._told, self._held = math.inf, False, "it has confirmed none so far"
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
     def start(
@@ -103,8 +117,52 @@ class SteeredNode(OdometryInstance):
         _log.warning(what, settings.odometry, settings.node, n, SILENT, why or usual)
 
     def apply(self, selection: Selection) -> None:
-        """Set the parameters, see `adaptune.ros.steering.Steering.apply`."""
-        self._steering.apply(selection.parameters)
+        """Ask the node to take the parameters, and no longer for others; see `confirmed`."""
+        if selection.parameters != self._wanted or self._verdict.done():
+            self._newest, self._wanted = self._newest + 1, selection.parameters
+            self._verdict = self._asking.submit(self._ask, self._newest, selection.parameters)
+
+    def confirmed(self, seconds: float = 0.0) -> bool:
+        try:
+            self._verdict.result(seconds)
+        except TimeoutError:
+            return False
+        return True
+
+    def close(self) -> None:
+        self._newest, self._wanted = self._newest + 1, None
+
+    def _ask(self, number: int, parameters: ParameterSet) -> None:
+        """Ask until the node confirms, see `adaptune.ros.steering.Steering.apply`, or refuses."""
+        self._asked, node = number, self._settings.node
+        self._since = min(self._since, time.monotonic())
+        while number == self._newest:
+            try:
+                self._steering.apply(parameters)
+            except BusyError as error:
+                self._unread += 1
+                self._tell_of_delay(error)
+            except AdaptuneError as error:
+                # It may be the answer to what was asked before.
+                if number == self._newest and not self._unread:
+                    self._since = math.inf
+                    raise
+                self._unread = max(self._unread - 1, 0)
+                self._tell_of_delay(error)
+            else:
+                if self._told:
+                    late = time.monotonic() - self._since
+                    _log.warning("%s has confirmed what it was asked for, %.1f s late", node, late)
+                self._since, self._told, self._unread = math.inf, False, 0
+                values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
+                self._held = f"it has confirmed {values} at {time.strftime('%H:%M:%S')}"
+                return
+        raise BusyError(f"{node} has not confirmed it")
+
+    def _tell_of_delay(self, error: AdaptuneError) -> None:
+        if not self._told and time.monotonic() - self._since >= _BUSY:
+            self._told = True
+            _log.warning("%s; the newest set stays asked for; %s", error, self._held)
 
     def _take(self, message: Any) -> None:
         for stamp, _, position, orientation in POSES[ODOMETRY](message):

@@ -20,7 +20,7 @@ from rosbags.typesys.store import Typestore
 
 from adaptune import processes
 from adaptune.ros import ros1_node
-from adaptune.ros.link import LinkError, take_all, telling
+from adaptune.ros.link import BusyError, LinkError, take_all, telling
 from adaptune.ros.ros2 import BUFFER_CURE, RECEIVE_BUFFER, message_types
 
 _START = 20.0  # seconds in which the node must be ready
@@ -102,7 +102,11 @@ class Relay:
         return {}
 
     def set_parameters(
-        self, node: str, values: Mapping[str, Any], keys: Mapping[str, Sequence[str]] | None = None
+        self,
+        node: str,
+        values: Mapping[str, Any],
+        outdated: Callable[[], bool] = lambda: False,  # noqa: ARG002
+        keys: Mapping[str, Sequence[str]] | None = None,
     ) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
 
@@ -113,7 +117,7 @@ class Relay:
         try:
             held: dict[str, Any] = self.ask("set_parameters", **asked)
         except LinkError as error:
-            raise LinkError(f"{node}: {error}") from error
+            raise type(error)(f"{node}: {error}") from error
         return held
 
     def topics(self) -> Mapping[str, str]:
@@ -134,7 +138,7 @@ class Relay:
             self._send({**given, "type": kind, "number": number})
             answer = waiting.get(timeout=_ANSWER)
         except Empty as error:
-            raise LinkError(f"no answer in {_ANSWER:g} s") from error
+            raise BusyError(f"no answer in {_ANSWER:g} s") from error
         finally:
             del self._answers[number]
         if "refused" in answer:

@@ -242,7 +242,7 @@ class RosSystem(ABC):
         """What sets parameters of the settings' node while it runs, if that is named."""
         if (node := self._settings.node) is None:
             return None
-        set_them = lambda values: self.link.set_parameters(node, values, self._keys)  # noqa: E731
+        set_them = lambda values: self.link.set_parameters(node, values, keys=self._keys)  # noqa: E731
         return Steering(node, set_them, *self._command())
 
     def _command(self) -> tuple[Sequence[str] | None, Run | None]:
