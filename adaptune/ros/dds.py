@@ -298,11 +298,11 @@ class DdsLink:
                 time.sleep(_PAUSE)
         if response is not None:
             return response
-        services, kind = self._places(), LinkError
-        why = f"the services there are {', '.join(services) or 'none'}"
+        services, what = self._places(), f"{node} does not answer: {place} in ROS domain"
         if place in services:
-            why, kind = "it is there, but busy; it may still take what it got", BusyError
-        raise kind(f"{node} does not answer: {place} in ROS domain {self.domain}; {why}")
+            raise BusyError(f"{what} {self.domain}; it is there, but busy, and may take it later")
+        there = f"the services there are {', '.join(services) or 'none'}"
+        raise LinkError(f"{what} {self.domain}; {there}")
 
     def endpoints(
         self, which: int, topic: str | None = None, *, own: bool = False

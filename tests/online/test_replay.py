@@ -417,7 +417,7 @@ def test_a_set_counts_from_when_it_is_confirmed_on(caplog):
             super().apply(selection)
             self.trial, self.looks = selection.trial, 0
 
-        def confirmed(self, seconds=0.0):
+        def confirmed(self):
             self.looks += 1
             if self.trial == 3 and self.looks > 3:
                 raise OdometryError("no such gain")

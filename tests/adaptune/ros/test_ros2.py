@@ -164,7 +164,7 @@ def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, domain):
     words = f"in ROS domain {domain}; the services there are /deaf/.*, /robot/slam/"
     with pytest.raises(LinkError, match=f"/other does not answer: .* {words}"):
         link.set_parameters("/other", {"voxel_size": 1.0})
-    words = "/deaf does not answer: /deaf/set_parameters .*; it is there, but busy; it may still"
+    words = "/deaf does not answer: /deaf/set_parameters .*; it is there, but busy, and may"
     with pytest.raises(BusyError, match=words):
         link.set_parameters("/deaf", {"voxel_size": 1.0})
 
