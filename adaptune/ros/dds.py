@@ -40,7 +40,7 @@ _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_NEVER = lambda: False  # noqa: E731
+_NEVER: Callable[[], bool] = lambda: False  # noqa: E731
 _ALL = core.ViewState.Any | core.SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
@@ -95,7 +95,7 @@ class DdsLink:
             self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
             self._answered: set[str] = set()  # services
-            self._outdated = _NEVER  # whether nobody waits any more for what is called
+            self._outdated: Callable[[], bool] = _NEVER  # whether nobody waits any more
             self._numbers, self._id = itertools.count(1), random.getrandbits(64)
             self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
             self._nodes: dict[bytes, str] = {}
