@@ -34,9 +34,7 @@ class Choice(NamedTuple):
 
     stamp: int  # nanoseconds, of the scan that it was made from and first applied to
     selection: Selection
-    # To describe the scan and choose; in real time, from its arrival. A node that is busy confirms
-    # it later: until then.
-    seconds: float
+    seconds: float  # to describe the scan and choose; in real time, until it counts
     why_not: str = ""  # it was not applied; empty if it was
     fallen_back: str = ""  # why it is the fixed set; empty if it was chosen
 

@@ -1,12 +1,11 @@
 """Somebody else's odometry node, of which only parameters are set."""
 
 import logging
-import math
 import subprocess
 import threading
 import time
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -32,8 +31,8 @@ _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
 KEPT = 1000
 """Poses of a node, and scans of a drive, that are kept."""
-_BUSY = 2.0
-"""Seconds without an answer; then the log says so."""
+_BUSY = 2
+"""Sets without an answer; with one more, the log says so."""
 _GAP = 1.0
 """Seconds between poses over which a pose is interpolated."""
 
@@ -65,11 +64,9 @@ class SteeredNode(OdometryInstance):
         self._warned = False
         # Only a thread of its own waits for a node that is busy.
         self._asking, self._verdict = ThreadPoolExecutor(1), Future[None]()
-        self._wanted: ParameterSet | None = None
         self._newest = self._asked = 0
         self._unread = 0  # answers to what is no longer asked for, which may come
-        # Since when the node owes an answer, whether that was told, and what it confirmed before.
-        self._since, self._told, self._held = math.inf, False, "it has confirmed none so far"
+        self._told, self._held = False, "it has confirmed none so far"
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
     def start(
@@ -118,51 +115,40 @@ class SteeredNode(OdometryInstance):
 
     def apply(self, selection: Selection) -> None:
         """Ask the node to take the parameters, and no longer for others; see `confirmed`."""
-        if selection.parameters != self._wanted or self._verdict.done():
-            self._newest, self._wanted = self._newest + 1, selection.parameters
-            self._verdict = self._asking.submit(self._ask, self._newest, selection.parameters)
+        self._newest += 1
+        self._verdict = self._asking.submit(self._ask, self._newest, selection.parameters)
 
     def confirmed(self, seconds: float = 0.0) -> bool:
-        try:
-            self._verdict.result(seconds)
-        except TimeoutError:
-            return False
-        return True
+        wait((self._verdict,), seconds)
+        return self._verdict.done() and self._verdict.result() is None
 
     def close(self) -> None:
-        self._newest, self._wanted = self._newest + 1, None
+        self._newest += 1
 
     def _ask(self, number: int, parameters: ParameterSet) -> None:
         """Ask until the node confirms, see `adaptune.ros.steering.Steering.apply`, or refuses."""
         self._asked, node = number, self._settings.node
-        self._since = min(self._since, time.monotonic())
         while number == self._newest:
             try:
                 self._steering.apply(parameters)
-            except BusyError as error:
-                self._unread += 1
-                self._tell_of_delay(error)
             except AdaptuneError as error:
-                # It may be the answer to what was asked before.
-                if number == self._newest and not self._unread:
-                    self._since = math.inf
+                outdated = number != self._newest
+                no_answer = outdated or isinstance(error, BusyError)
+                # An answer may be to what was asked before.
+                if not (no_answer or self._unread):
                     raise
-                self._unread = max(self._unread - 1, 0)
-                self._tell_of_delay(error)
+                self._unread += 1 if no_answer else -1
+                if not self._told and (not outdated or self._unread > _BUSY):
+                    self._told = True
+                    _log.warning("%s; the newest set stays asked for; %s", error, self._held)
             else:
-                if self._told:
-                    late = time.monotonic() - self._since
-                    _log.warning("%s has confirmed what it was asked for, %.1f s late", node, late)
-                self._since, self._told, self._unread = math.inf, False, 0
                 values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
                 self._held = f"it has confirmed {values} at {time.strftime('%H:%M:%S')}"
+                if self._told:
+                    _log.warning("%s answers again: %s", node, self._held)
+                self._told, self._unread = False, 0
                 return
         raise BusyError(f"{node} has not confirmed it")
-
-    def _tell_of_delay(self, error: AdaptuneError) -> None:
-        if not self._told and time.monotonic() - self._since >= _BUSY:
-            self._told = True
-            _log.warning("%s; the newest set stays asked for; %s", error, self._held)
 
     def _take(self, message: Any) -> None:
         for stamp, _, position, orientation in POSES[ODOMETRY](message):

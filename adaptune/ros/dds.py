@@ -95,7 +95,7 @@ class DdsLink:
             self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
             self._answered: set[str] = set()  # services
-            self._outdated: Callable[[], bool] = _NEVER  # whether nobody waits any more
+            self._outdated: Callable[[], bool] = _NEVER  # of the newest parameters
             self._numbers, self._id = itertools.count(1), random.getrandbits(64)
             self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
             self._nodes: dict[bytes, str] = {}
@@ -229,12 +229,6 @@ class DdsLink:
     ) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`; after a refusal the node may hold the other values."""
         node, self._outdated = ros2.full(node), outdated
-        try:
-            return self._set(node, values)
-        finally:
-            self._outdated = _NEVER
-
-    def _set(self, node: str, values: Mapping[str, Any]) -> dict[str, Any]:
         given = [ros2.parameter_message(self.store, name, value) for name, value in values.items()]
         results = self._call(node, "SetParameters", len(given), parameters=given).results
         if refused := [

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -42,6 +43,7 @@ class Relay:
     store: Typestore
     encode: Callable[[Any, str], Any]  # a message of a type as bytes
     decode: Callable[[bytes, str], Any]  # the message of a type in bytes
+    keys: Mapping[str, Sequence[str]] = MappingProxyType({})  # of parameters, at another place
 
     def __init__(
         self, connection: socket.socket, running: Callable[[], bool], end: Callable[[], None]
@@ -106,14 +108,13 @@ class Relay:
         node: str,
         values: Mapping[str, Any],
         outdated: Callable[[], bool] = lambda: False,  # noqa: ARG002
-        keys: Mapping[str, Sequence[str]] | None = None,
     ) -> Mapping[str, Any]:
-        """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
+        """See `RosLink.set_parameters`.
 
         In ROS 1, they are set by dynamic_reconfigure where the node has it. The others are set at
         the parameter server: nobody tells what the node makes of them, so they are not returned.
         """
-        asked = {"node": node, "values": dict(values), "keys": dict(keys or {})}
+        asked = {"node": node, "values": dict(values), "keys": dict(self.keys)}
         try:
             held: dict[str, Any] = self.ask("set_parameters", **asked)
         except LinkError as error:
