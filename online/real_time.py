@@ -148,7 +148,8 @@ class RealTimeDrive:
         return step
 
     def finish(self) -> None:
-        """Record what selector and bank have counted."""
+        """Record what selector and bank have counted, and what was not confirmed."""
+        self._driver.give_up()
         if self._selector is not None:
             self.record.unseen = self._selector.unseen
         if isinstance(self._odometry, Bank):

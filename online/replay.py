@@ -34,7 +34,7 @@ class Choice(NamedTuple):
 
     stamp: int  # nanoseconds, of the scan that it was made from and first applied to
     selection: Selection
-    seconds: float  # to describe the scan and choose; in real time, from its arrival
+    seconds: float  # to describe the scan and choose; in real time, until it counts
     why_not: str = ""  # it was not applied; empty if it was
     fallen_back: str = ""  # why it is the fixed set; empty if it was chosen
 
@@ -62,6 +62,7 @@ class Driver:
         self._odometry, self._fixed, self._what, self._note = odometry, fixed, what, note
         self._tracker = Tracker(odometry, health, None if fixed is None else self._unhealthy)
         self._applied = fixed
+        self._asked: Choice | None = None  # what the odometry has not confirmed yet
         self._since = 0  # when that was first applied
         self._first: int | None = None  # stamp
         self._avoided: dict[int, int] = {}  # until when, by trial
@@ -72,20 +73,54 @@ class Driver:
         if selection.weights is None and stamp < self._avoided.get(selection.trial, stamp):
             self._note(choice._replace(why_not="the odometry failed with it"))
             return
+        self._ask(choice)
+
+    def _ask(self, choice: Choice) -> bool:
+        """Ask for a selection alone; whether the odometry takes it, as far as is known."""
+        self.give_up()
+        self._asked = choice
+        return self._settle(choice.stamp, self._odometry.apply)
+
+    def give_up(self) -> None:
+        """Note that what is not confirmed is no longer asked for."""
+        if self._asked is not None:
+            self._note(self._asked._replace(why_not="not confirmed in time"))
+            self._asked = None
+
+    def _settle(self, stamp: int, apply: Callable[[Selection], None] = lambda _: None) -> bool:
+        """Note what became of what is asked for; whether it was not refused."""
+        if (choice := self._asked) is None:
+            return True
+        selection, why = choice.selection, choice.fallen_back
         try:
-            self._odometry.apply(selection)
+            apply(selection)
+            if not self._odometry.confirmed():
+                return True
         except AdaptuneError as error:
+            self._asked = None
             if self._fixed is None:
                 raise
-            why = f"trial {selection.trial} cannot be applied: {error}"
-            self._note(choice._replace(why_not=str(error)))
-            self._fall_back(stamp, selection, why)
-            return
-        self._tell(choice)
+            if why:
+                # The next selection tries again.
+                self._applied = self._fixed
+                what = "%s: %s at %.1f s; nor can the fixed set: %s"
+                _log.warning(what, self._what, why, self._seconds(choice.stamp), error)
+            else:
+                self._note(choice._replace(why_not=str(error)))
+                why = f"trial {selection.trial} cannot be applied: {error}"
+                self._fall_back(stamp, selection, why)
+            return False
+        self._asked = None
+        if why:
+            seconds, used = self._seconds(choice.stamp), used_instead(selection)
+            _log.warning("%s: %s at %.1f s; %s", self._what, why, seconds, used)
+        else:
+            self._tell(choice)
         if self._applied is None or self._applied.trial != selection.trial:
             self._since = stamp
         self._applied = selection
-        self._note(choice)
+        self._note(choice._replace(seconds=choice.seconds + 1e-9 * (stamp - choice.stamp)))
+        return True
 
     @property
     def motions(self) -> Motions:
@@ -97,6 +132,7 @@ class Driver:
     ) -> RegisteredScan:
         """Find the pose of the next scan, which the odometry may have prepared in so long."""
         self._first = scan.stamp if self._first is None else self._first
+        self._settle(scan.stamp)
         if seconds is None:
             return self._tracker.register(scan)
         return self._tracker.register_prepared(scan.stamp, prepared, seconds, scan)
@@ -109,7 +145,8 @@ class Driver:
         applied, fixed = self._applied, self._fixed
         if applied is None or fixed is None:
             return False
-        if applied[:3] == fixed[:3] and not applied.resting:
+        newest = applied if self._asked is None else self._asked.selection
+        if newest[:3] == fixed[:3] and not newest.resting:
             return False
         is_baseline = applied.weights is None and applied.trial == BASELINE
         if is_baseline and stamp - self._since <= SETTLING:
@@ -121,18 +158,7 @@ class Driver:
         assert fixed is not None
         if failed.weights is None and failed.trial != fixed.trial:
             self._avoided[failed.trial] = stamp + round(REMEMBERED * 1e9)
-        seconds = self._seconds(stamp)
-        # Where that fails, too, the next selection tries again.
-        self._applied = fixed
-        try:
-            self._odometry.apply(fixed)
-        except AdaptuneError as error:
-            what = "%s: %s at %.1f s; nor can the fixed set: %s"
-            _log.warning(what, self._what, why, seconds, error)
-            return False
-        _log.warning("%s: %s at %.1f s; %s", self._what, why, seconds, used_instead(fixed))
-        self._note(Choice(stamp, fixed, 0.0, fallen_back=why))
-        return True
+        return self._ask(Choice(stamp, fixed, 0.0, fallen_back=why))
 
     def _seconds(self, stamp: int) -> float:
         """Since the first scan."""

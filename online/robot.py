@@ -32,6 +32,7 @@ from online.selector_process import SelectorProcess
 from online.steered import KEPT, ODOMETRY, SteeredNode
 
 SELECTION_TOPIC = "adaptune/selection"
+_BEGIN = 6.0  # seconds in which a node that is not there is known to be missing
 
 _log = logging.getLogger(__name__)
 
@@ -155,6 +156,8 @@ class RobotDrive:
             try:
                 if selector is not None:
                     odometry.apply(selector.fixed)
+                    # One that is there, but busy, takes it when it can.
+                    odometry.confirmed(0.0 if done else _BEGIN)
             except AdaptuneError as error:
                 if not done:
                     raise

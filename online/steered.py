@@ -3,20 +3,22 @@
 import logging
 import subprocess
 import threading
+import time
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
 
-from adaptune.errors import OdometryError, warn_once
+from adaptune.errors import AdaptuneError, OdometryError, warn_once
 from adaptune.geometry import Poses, invert, to_pose
 from adaptune.odometry.base import OdometryInstance, Registration
 from adaptune.recording.pose_messages import POSES
 from adaptune.recording.scan import Scan
-from adaptune.ros.link import LinkError, RosLink
+from adaptune.ros.link import BusyError, LinkError, RosLink
 from adaptune.ros.steering import Steering
 from adaptune.selector import BACK
-from adaptune.space import Selection
+from adaptune.space import ParameterSet, Selection
 from adaptune.study.config import SteerConfig
 from adaptune.trajectory import Trajectory
 
@@ -29,6 +31,8 @@ _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
 KEPT = 1000
 """Poses of a node, and scans of a drive, that are kept."""
+_BUSY = 2
+"""Sets without an answer; with one more, the log says so."""
 _GAP = 1.0
 """Seconds between poses over which a pose is interpolated."""
 
@@ -49,13 +53,20 @@ class SteeredNode(OdometryInstance):
         self._T_odom_node: Poses | None = None
         self._steering = Steering(
             settings.node,
-            lambda parameters: link.set_parameters(settings.node, parameters),
+            lambda parameters: link.set_parameters(
+                settings.node, parameters, lambda: self._asked != self._newest
+            ),
             settings.command,
             _run,
         )
         self._silent: deque[bool] = deque(maxlen=SILENT)
         self._missed: deque[int] = deque(maxlen=KEPT)  # stamps of scans without a pose in time
         self._warned = False
+        # Only a thread of its own waits for a node that is busy.
+        self._asking, self._verdict = ThreadPoolExecutor(1), Future[None]()
+        self._newest = self._asked = 0
+        self._unread = 0  # answers to what is no longer asked for, which may come
+        self._told, self._held = False, "it has confirmed none so far"
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
     def start(
@@ -103,8 +114,41 @@ class SteeredNode(OdometryInstance):
         _log.warning(what, settings.odometry, settings.node, n, SILENT, why or usual)
 
     def apply(self, selection: Selection) -> None:
-        """Set the parameters, see `adaptune.ros.steering.Steering.apply`."""
-        self._steering.apply(selection.parameters)
+        """Ask the node to take the parameters, and no longer for others; see `confirmed`."""
+        self._newest += 1
+        self._verdict = self._asking.submit(self._ask, self._newest, selection.parameters)
+
+    def confirmed(self, seconds: float = 0.0) -> bool:
+        wait((self._verdict,), seconds)
+        return self._verdict.done() and self._verdict.result() is None
+
+    def close(self) -> None:
+        self._newest += 1
+
+    def _ask(self, number: int, parameters: ParameterSet) -> None:
+        """Ask until the node confirms, see `adaptune.ros.steering.Steering.apply`, or refuses."""
+        self._asked, node = number, self._settings.node
+        while number == self._newest:
+            try:
+                self._steering.apply(parameters)
+            except AdaptuneError as error:
+                outdated = number != self._newest
+                no_answer = outdated or isinstance(error, BusyError)
+                # An answer may be to what was asked before.
+                if not (no_answer or self._unread):
+                    raise
+                self._unread += 1 if no_answer else -1
+                if not self._told and (not outdated or self._unread > _BUSY):
+                    self._told = True
+                    _log.warning("%s; the newest set stays asked for; %s", error, self._held)
+            else:
+                values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
+                self._held = f"it has confirmed {values} at {time.strftime('%H:%M:%S')}"
+                if self._told:
+                    _log.warning("%s answers again: %s", node, self._held)
+                self._told, self._unread = False, 0
+                return
+        raise BusyError(f"{node} has not confirmed it")
 
     def _take(self, message: Any) -> None:
         for stamp, _, position, orientation in POSES[ODOMETRY](message):

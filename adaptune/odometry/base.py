@@ -259,6 +259,10 @@ class OdometryInstance(ABC):
         """
         raise NotImplementedError
 
+    def confirmed(self, seconds: float = 0.0) -> bool:  # noqa: ARG002
+        """Whether it is known to hold what was applied last; an error, as of `apply`, if not."""
+        return True
+
     def close(self) -> None:  # noqa: B027 - most have none
         """End all processes of this odometry."""
 

@@ -28,7 +28,7 @@ from cyclonedds.util import duration
 from adaptune.errors import nearest
 from adaptune.recording.clouds import CLOUDS
 from adaptune.ros import ros2
-from adaptune.ros.link import LinkError, take_all
+from adaptune.ros.link import BusyError, LinkError, take_all
 
 _ANSWER = 2.0  # seconds in which a service must answer
 _DISCOVERY = 1.5  # seconds in which other nodes are found
@@ -40,6 +40,7 @@ _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_NEVER: Callable[[], bool] = lambda: False  # noqa: E731
 _ALL = core.ViewState.Any | core.SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
@@ -93,6 +94,8 @@ class DdsLink:
             self._kept: list[Any] = []
             self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
+            self._answered: set[str] = set()  # services
+            self._outdated: Callable[[], bool] = _NEVER  # of the newest parameters
             self._numbers, self._id = itertools.count(1), random.getrandbits(64)
             self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
             self._nodes: dict[bytes, str] = {}
@@ -142,7 +145,9 @@ class DdsLink:
                 self._kept.remove(reader)
                 reader = self._topic_end(DataReader, topic, kind, reliable=False)
 
-    def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
+    def _waited(
+        self, reader: DataReader, seconds: float = np.inf, over: Callable[[], bool] = _NEVER
+    ) -> Iterator[Any]:
         """Samples as they come, until that takes too long, or somebody offers another QoS."""
         ready = core.WaitSet(self._participant)
         for condition in (
@@ -151,8 +156,9 @@ class DdsLink:
             core.ReadCondition(reader, _ALL | core.InstanceState.Any),
         ):
             ready.attach(condition)
-        limit = duration(weeks=9999) if seconds is None else duration(seconds=seconds)
-        while ready.wait(limit) and not self._closed:
+        end, forever = time.monotonic() + seconds, seconds == np.inf
+        limit = duration(weeks=9999) if forever else duration(seconds=_PAUSE)
+        while (ready.wait(limit) or time.monotonic() < end) and not self._closed and not over():
             yield from (s for s in reader.take(N=_DEPTH) if s.sample_info.valid_data)
             if reader.get_requested_incompatible_qos_status().total_count:
                 return
@@ -218,9 +224,11 @@ class DdsLink:
             )
         return ""
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def set_parameters(
+        self, node: str, values: Mapping[str, Any], outdated: Callable[[], bool] = _NEVER
+    ) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`; after a refusal the node may hold the other values."""
-        node = ros2.full(node)
+        node, self._outdated = ros2.full(node), outdated
         given = [ros2.parameter_message(self.store, name, value) for name, value in values.items()]
         results = self._call(node, "SetParameters", len(given), parameters=given).results
         if refused := [
@@ -275,7 +283,7 @@ class DdsLink:
         response = None
         with self._calling:
             end = max(time.monotonic(), self._joined + _DISCOVERY) + _ANSWER
-            while (left := end - time.monotonic()) > 0:
+            while (left := end - time.monotonic()) > 0 and not self._outdated():
                 for reply in self._ask(place, asked, raw, left):
                     with contextlib.suppress(Exception):  # it answers another request
                         response = self.store.deserialize_cdr(reply, asked.response)
@@ -284,11 +292,11 @@ class DdsLink:
                 time.sleep(_PAUSE)
         if response is not None:
             return response
-        services = self._places()
-        why = f"the services there are {', '.join(services) or 'none'}"
+        services, what = self._places(), f"{node} does not answer: {place} in ROS domain"
         if place in services:
-            why = f"it is there, but busy for {_ANSWER:g} s or more; it may still take what it got"
-        raise LinkError(f"{node} does not answer: {place} in ROS domain {self.domain}; {why}")
+            raise BusyError(f"{what} {self.domain}; it is there, but busy, and may take it later")
+        there = f"the services there are {', '.join(services) or 'none'}"
+        raise LinkError(f"{what} {self.domain}; {there}")
 
     def endpoints(
         self, which: int, topic: str | None = None, *, own: bool = False
@@ -341,7 +349,10 @@ class DdsLink:
             head = struct.pack("<Qq", self._id, next(self._numbers)) if cyclone else b""
             reader.take(N=_DEPTH)
             writer.write(writer.data_type(request[:4] + head + request[4:]))
-            for sample in self._waited(reader, min(seconds, _AGAIN)):
+            # Who has answered once is busy, and needs no second request.
+            seconds = seconds if place in self._answered else min(seconds, _AGAIN)
+            for sample in self._waited(reader, seconds, self._outdated):
+                self._answered.add(place)
                 if sample.data[4 : 4 + len(head)] == head:
                     yield sample.data[:4] + sample.data[4 + len(head) :]
 

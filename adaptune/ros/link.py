@@ -16,6 +16,10 @@ class LinkError(AdaptuneError):
     """A robot that cannot be reached, or that refuses what is asked of it."""
 
 
+class BusyError(LinkError):
+    """A node that is there has not answered yet; it may still take what it was sent."""
+
+
 class RosLink(Protocol):
     """A node of adaptune's in a robot's ROS.
 
@@ -34,10 +38,13 @@ class RosLink(Protocol):
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
         """Announce a topic; what is returned publishes a message on it."""
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def set_parameters(
+        self, node: str, values: Mapping[str, Any], outdated: Callable[[], bool]
+    ) -> Mapping[str, Any]:
         """Set parameters of another node; what it then holds, as far as it tells.
 
-        There is a LinkError if the node is not there, does not answer, or refuses a value.
+        There is a LinkError if the node is not there or refuses a value, and `BusyError` if it
+        does not answer in time, or not before the values are `outdated`.
         """
 
     def topics(self) -> Mapping[str, str]:

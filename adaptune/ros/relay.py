@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ from rosbags.typesys.store import Typestore
 
 from adaptune import processes
 from adaptune.ros import ros1_node
-from adaptune.ros.link import LinkError, take_all, telling
+from adaptune.ros.link import BusyError, LinkError, take_all, telling
 from adaptune.ros.ros2 import BUFFER_CURE, RECEIVE_BUFFER, message_types
 
 _START = 20.0  # seconds in which the node must be ready
@@ -42,6 +43,7 @@ class Relay:
     store: Typestore
     encode: Callable[[Any, str], Any]  # a message of a type as bytes
     decode: Callable[[bytes, str], Any]  # the message of a type in bytes
+    keys: Mapping[str, Sequence[str]] = MappingProxyType({})  # of parameters, at another place
 
     def __init__(
         self, connection: socket.socket, running: Callable[[], bool], end: Callable[[], None]
@@ -102,18 +104,21 @@ class Relay:
         return {}
 
     def set_parameters(
-        self, node: str, values: Mapping[str, Any], keys: Mapping[str, Sequence[str]] | None = None
+        self,
+        node: str,
+        values: Mapping[str, Any],
+        outdated: Callable[[], bool] = lambda: False,  # noqa: ARG002
     ) -> Mapping[str, Any]:
-        """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
+        """See `RosLink.set_parameters`.
 
         In ROS 1, they are set by dynamic_reconfigure where the node has it. The others are set at
         the parameter server: nobody tells what the node makes of them, so they are not returned.
         """
-        asked = {"node": node, "values": dict(values), "keys": dict(keys or {})}
+        asked = {"node": node, "values": dict(values), "keys": dict(self.keys)}
         try:
             held: dict[str, Any] = self.ask("set_parameters", **asked)
         except LinkError as error:
-            raise LinkError(f"{node}: {error}") from error
+            raise type(error)(f"{node}: {error}") from error
         return held
 
     def topics(self) -> Mapping[str, str]:
@@ -134,7 +139,7 @@ class Relay:
             self._send({**given, "type": kind, "number": number})
             answer = waiting.get(timeout=_ANSWER)
         except Empty as error:
-            raise LinkError(f"no answer in {_ANSWER:g} s") from error
+            raise BusyError(f"no answer in {_ANSWER:g} s") from error
         finally:
             del self._answers[number]
         if "refused" in answer:

@@ -409,6 +409,32 @@ def test_where_the_fixed_set_cannot_be_applied_either_the_last_set_stays(caplog)
     assert len(result.trajectory) == 40
 
 
+def test_a_set_counts_from_when_it_is_confirmed_on(caplog):
+    class Slow(InProcess):
+        """Confirms a set, or refuses it, three scans later; never trial 2."""
+
+        def apply(self, selection):
+            super().apply(selection)
+            self.trial, self.looks = selection.trial, 0
+
+        def confirmed(self):
+            self.looks += 1
+            if self.trial == 3 and self.looks > 3:
+                raise OdometryError("no such gain")
+            return self.trial != 2 and self.looks > 3
+
+    odometry = Slow(Fragile())
+    selector = InTurns(1.0, 2.0, 3.0, 1.0)
+    result = replay(tenths(33), odometry, HEALTH, selector, what="home", fixed=FIXED)
+    why = "trial 3 cannot be applied: no such gain"
+    found = [(c.stamp // TENTH, c.selection.trial, c.fallen_back) for c in result.choices]
+    assert found == [(0, 1, ""), (22, 0, why), (30, 1, "")]
+    assert [c.seconds for c in result.choices] == pytest.approx([0.2, 0.3, 0.2], abs=0.05)
+    found = [(c.stamp // TENTH, c.selection.trial, c.why_not) for c in result.rejected]
+    assert found == [(10, 2, "not confirmed in time"), (20, 3, "no such gain")]
+    assert f"home: {why} at 2.2 s; the fixed set is used" in caplog.text
+
+
 def test_without_a_fixed_set_a_switch_that_fails_is_an_error():
     with pytest.raises(OdometryError, match="no such gain"):
         drive(Fragile(refuses=(2.0,)), InTurns(2.0), fixed=None)

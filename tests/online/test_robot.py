@@ -17,7 +17,7 @@ from adaptune.errors import AdaptuneError, OdometryError, warn_once
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.scan import Scan
-from adaptune.ros.link import LinkError
+from adaptune.ros.link import BusyError, LinkError
 from adaptune.space import Selection
 from adaptune.study.config import SteerConfig
 from adaptune.study.driven import ModeError
@@ -350,26 +350,32 @@ def test_poses_of_another_frame_become_those_of_the_sensor(link, node):
     np.testing.assert_allclose(T[:3, 3], [0.0, -0.1, 0.0], atol=1e-9)
 
 
+def apply(odometry, trial, **parameters):
+    """Apply a set, and wait until the node has said what becomes of it."""
+    odometry.apply(Selection(trial, parameters))
+    assert odometry.confirmed(20.0)
+
+
 def test_what_the_node_holds_is_compared(link, node):
     odometry = node()
-    odometry.apply(Selection(1, {"voxel": 0.5}))
+    apply(odometry, 1, voxel=0.5)
     assert link.holds == {"voxel": 0.5}
     link.refuses = ("voxel",)
     with pytest.raises(LinkError, match="refuses voxel"):
-        odometry.apply(Selection(2, {"voxel": 0.7}))
+        apply(odometry, 2, voxel=0.7)
     link.set_parameters = lambda *_: {"voxel": "fine"}
     with pytest.raises(OdometryError, match="/node holds voxel = fine"):
-        odometry.apply(Selection(2, {"voxel": 0.7}))
+        apply(odometry, 2, voxel=0.7)
     link.set_parameters = lambda *_: {"voxel": 0.5}
     with pytest.raises(OdometryError, match=r"/node holds voxel = 0\.5"):
-        odometry.apply(Selection(2, {"voxel": 0.7}))
+        apply(odometry, 2, voxel=0.7)
 
 
 def test_it_says_once_that_nobody_knows_whether_a_parameter_counts(link, node, caplog):
     odometry = node()
     link.set_parameters = lambda *_: {}
     for value in (0.5, 0.6):
-        odometry.apply(Selection(1, {"voxel": value}))
+        apply(odometry, 1, voxel=value)
     assert caplog.messages == [
         "/node: nobody says whether voxel takes effect before the node starts again"
     ]
@@ -379,7 +385,7 @@ def test_a_command_sets_parameters(tmp_path, node):
     write = "import sys; open(sys.argv[1], 'a').write(' '.join(sys.argv[2:]) + '\\n')"
     command = [sys.executable, "-c", write, str(tmp_path / "set"), "{node}", "{name}={value}"]
     odometry = node(command=command)
-    odometry.apply(Selection(1, {"voxel": 1e-5, "n": 3, "on": True, "name": "a b"}))
+    apply(odometry, 1, voxel=1e-5, n=3, on=True, name="a b")
     assert (tmp_path / "set").read_text().splitlines() == [
         "/node voxel=0.00001",
         "/node n=3",
@@ -391,9 +397,59 @@ def test_a_command_sets_parameters(tmp_path, node):
 def test_a_command_that_fails_is_named(node):
     odometry = node(command=[sys.executable, "-c", "exit('no {name} {value}')"])
     with pytest.raises(OdometryError, match=r"exit code 1: no voxel 0\.5$"):
-        odometry.apply(Selection(1, {"voxel": 0.5}))
+        apply(odometry, 1, voxel=0.5)
     with pytest.raises(OdometryError, match="nowhere"):
-        node(command=["nowhere", "{name}", "{value}"]).apply(Selection(1, {"voxel": 0.5}))
+        apply(node(command=["nowhere", "{name}", "{value}"]), 1, voxel=0.5)
+
+
+def test_nobody_waits_for_a_node_that_is_busy_and_it_gets_the_newest_set_last(link, node, caplog):
+    odometry = node()
+    apply(odometry, 0, voxel=0.5)
+    link.free.clear()
+    for trial, voxel in ((1, 0.6), (2, 0.7), (0, 0.5)):
+        odometry.apply(Selection(trial, {"voxel": voxel}))
+    play(link, 0, TENTH)
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    assert odometry.register(scan(TENTH)).registered
+    assert not odometry.confirmed()
+    link.free.set()
+    assert odometry.confirmed(20.0)
+    assert link.holds == link.asked[-1] == {"voxel": 0.5}
+    assert not caplog.messages
+
+
+def test_what_a_busy_node_has_confirmed_is_told(link, node, caplog):
+    odometry = node()
+    apply(odometry, 0, voxel=0.5, n=3)
+    busy, given = link.set_parameters, [BusyError("/node is busy"), BusyError("still")]
+
+    def answer(*asked):
+        if given:
+            raise given.pop(0)
+        return busy(*asked)
+
+    link.set_parameters = answer
+    apply(odometry, 1, voxel=0.6, n=4)
+    first, second = caplog.messages
+    said = "/node is busy; the newest set stays asked for; it has confirmed voxel = 0.5, n = 3 at "
+    assert first.startswith(said)
+    assert second.startswith("/node answers again: it has confirmed voxel = 0.6, n = 4 at ")
+
+
+def test_a_refusal_of_what_is_no_longer_asked_for_does_not_count(link, node):
+    odometry = node()
+    answers = [BusyError("/node is busy"), LinkError("/node refuses voxel = 9")]
+
+    def answer(_, values, __):
+        if answers:
+            raise answers.pop(0)
+        return values
+
+    link.set_parameters = answer
+    apply(odometry, 1, voxel=0.5)
+    answers += [LinkError("/node refuses voxel = 0.6")]
+    with pytest.raises(LinkError, match=r"refuses voxel = 0\.6"):
+        apply(odometry, 1, voxel=0.6)
 
 
 def test_a_command_names_the_parameter_and_its_value():

@@ -6,7 +6,7 @@ from collections import defaultdict
 import rec
 from drives import cloud
 
-from adaptune.ros.link import LinkError
+from adaptune.ros.link import BusyError, LinkError
 from online.live import IMU, RosMessages, placed
 
 STORE = rec.ROS1
@@ -28,6 +28,8 @@ class LocalLink:
         self.kinds = {}
         self.holds = {}
         self.refuses = ()
+        self.free, self.asked, self._owed = threading.Event(), [], []
+        self.free.set()  # otherwise the node is busy, and takes what it got afterwards
         self.deaf = ""
         self._takers = defaultdict(list)
 
@@ -56,9 +58,17 @@ class LocalLink:
         for take in self._takers[topic]:
             take(message)
 
-    def set_parameters(self, node, values):
+    def set_parameters(self, node, values, outdated):
         if node != "/node":
             raise LinkError(f"{node}: unknown node")
+        self.asked.append(dict(values))
+        self._owed.append(values)
+        while not self.free.wait(0.001):
+            if outdated():
+                raise BusyError(f"{node} is busy")
+        while len(self._owed) > 1:
+            self.holds |= self._owed.pop(0)
+        self._owed.clear()
         if refused := [name for name in values if name in self.refuses]:
             raise LinkError(f"{node} refuses {refused[0]}")
         self.holds |= values

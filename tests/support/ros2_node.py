@@ -125,6 +125,12 @@ class DdsNode:
         reader = self.end(DataReader, topic if latched else f"rt{topic}", kind, latched=latched)
         self._taking(reader, lambda data: take(self.store.deserialize_cdr(data, kind)))
 
+    def watch(self, place, kind, take):
+        """Have every request of a service taken as it comes."""
+        from cyclonedds.sub import DataReader
+
+        self._taking(self.end(DataReader, f"rq{place}Request", f"{kind}_Request"), take)
+
     def serve(self, place, kind, answer=None, before=None):
         """Answer a service's requests; `before` is an answer to somebody else."""
         from cyclonedds.pub import DataWriter

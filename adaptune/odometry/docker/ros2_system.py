@@ -66,6 +66,7 @@ NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
 _BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05  # seconds
+_NOT_FOUND = 127  # a shell's exit code
 _UNDECLARED = 3.0  # seconds in which a node that subscribes declares its parameters
 _MATCHED = 3.0  # seconds in which nodes find what is published
 _LEAD = 300_000_000  # nanoseconds between the begin of the clock and of the recording
@@ -154,6 +155,9 @@ class Ros2System(RosSystem):
         """How the system ended; None while it runs."""
         if (code := self._container.ended()) is None:
             return None
+        program = self._settings.command[0]
+        if code == _NOT_FOUND and f"exec: {program}: not found" in self.words():
+            return f"a login shell of the image finds no {program!r}: is it a ROS 2 image?"
         return f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
 
     def state(self, fresh: bool = False) -> dict[str, Any]:

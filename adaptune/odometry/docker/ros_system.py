@@ -12,7 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -111,7 +111,6 @@ class RosSystem(ABC):
         self._settings, self._topics = settings, [settings.odometry]
         self.usage, self._memory, self._recording = Usage(0.0, 0.0), memory, recording
         self._clock: SimClock | None = None
-        self._keys: Mapping[str, Sequence[str]] = {}  # of a parameter server
         self.folder, self._given = engine.make_shared(folder / "shared"), folder / "given"
         self._given.mkdir()
         self._parameters = self._given / "params.yaml"
@@ -242,8 +241,7 @@ class RosSystem(ABC):
         """What sets parameters of the settings' node while it runs, if that is named."""
         if (node := self._settings.node) is None:
             return None
-        set_them = lambda values: self.link.set_parameters(node, values, self._keys)  # noqa: E731
-        return Steering(node, set_them, *self._command())
+        return Steering(node, partial(self.link.set_parameters, node), *self._command())
 
     def _command(self) -> tuple[Sequence[str] | None, Run | None]:
         """What sets a parameter in place of ROS, and what runs it, if anything."""

@@ -143,10 +143,10 @@ class Ros1System(RosSystem):
         return state
 
     def check(self, template: Template, parameters: ParameterSet) -> None:
-        self._keys = server_keys(template, parameters, self.link.ask("parameters"))
+        self.link.keys = server_keys(template, parameters, self.link.ask("parameters"))
 
     def warn_of_unread(self) -> None:
-        warn_of_unread(self.link, self._settings.image, self._keys)
+        warn_of_unread(self.link, self._settings.image, self.link.keys)
 
     def whole_name(self, template: Template, name: str) -> str:
         return "/".join(template.path_of(name))

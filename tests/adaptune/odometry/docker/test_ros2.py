@@ -116,6 +116,11 @@ def test_on_this_machine_it_needs_no_container(make):
             "/parameter_events is rcl_interfaces/msg/ParameterEvent; .*must name poses",
         ),
         (VALUES, {"command": ("/no-such", "{parameters}")}, "its process ended with code 127: "),
+        (
+            VALUES,
+            {"command": ("ros2", "run", "{parameters}")},
+            "a login shell of the image finds no 'ros2': is it a ROS 2 image",
+        ),
     ],
 )
 def test_one_that_cannot_begin_says_why(make, parameters, settings, words):
