@@ -186,13 +186,13 @@ def why_not(blocks: BlockErrors, trial: int, fixed: int) -> str:
     k, own = list(blocks.trials).index(trial), blocks.baseline
     if surely_restarted(blocks)[k]:
         n, base = (f"{blocks.restarts[column]:g}" for column in (k, own))
-        return f"the health check restarts it {n} times, the odometry's own parameters {base} times"
+        return f"the health check restarts it more often ({n} against {base} of the baseline)"
     for what, errors in (("", blocks.errors), (" in rotation", blocks.turns)):
         if errors is not None and surely_worse(blocks._replace(errors=errors))[k]:
             return f"it is surely worse than the odometry's own parameters{what} on a recording"
     bound = bounds(blocks)
     mine, other = (f"{bound[list(blocks.trials).index(one)]:.2f}" for one in (trial, fixed))
-    return f"its error is less sure: by its bound, {mine} times the baseline's, against {other}"
+    return f"its error is less sure (by its bound {mine} times the baseline's, against {other})"
 
 
 def choose(blocks: BlockErrors, budget: float | None = None) -> int:
