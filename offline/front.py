@@ -119,8 +119,8 @@ def left_out(
             else:
                 why = why_not(blocks, trial, model.fixed)
             return (
-                f"Trial {trial}, with {errors[k]:.2f} times the error for {ms[k]:.2f} times the CPU "
-                f"time in training, is left out: {why}."
+                f"Trial {trial}, with {errors[k]:.2f} times the error for {ms[k]:.2f} times the "
+                f"CPU time in training, is left out: {why}."
             )
     return ""
 

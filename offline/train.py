@@ -128,11 +128,11 @@ def train(
             sets = {n: every_set[n] for n in sorted({*data.finalists(), *every_set.defaults})}
             drive_whole(study, sets, archive, workers, progress)
 
-        tried = data.usable()
-        usable = in_whole_drives(tried, archive, config, drive)
+        judged = data.usable()
+        usable = in_whole_drives(judged, archive, config, drive)
     whole = read_whole_drives(archive, names, [*usable.finalists(), *every_set.defaults])
     fixed = usable.fixed()
-    dropped = sorted({*tried.sets} - {*usable.sets})
+    dropped = sorted({*judged.sets} - {*usable.sets})
     data = data._replace(costs=(usable.beside or data.costs).without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     chosen = usable.front()
@@ -155,7 +155,7 @@ def train(
     # Others were dropped because they did not drive.
     worse = driven_bare(archive, names, dropped)
     said += bare_in_words(archive, whole, fixed, worse)
-    rows_of_front = front_rows(usable, model, left_out(tried, usable, model, worse))
+    rows_of_front = front_rows(usable, model, left_out(judged, usable, model, worse))
     tables.write_rows(study.folder, "front", rows_of_front)
     failed = [*unread_in_words(finished), *failed_in_words(verdicts)]
     return Training(model, trials, rows, said, failed, rows_of_front)

@@ -29,17 +29,16 @@ def front_table(front: Sequence[Mapping[str, Any]], title: str, how: str) -> Lis
         trial, of = row["trial"], f" ({row['odometry']})" if row["odometry"] else ""
         what = "-> " * row["recommended"] + row["what"]
         what += f": trial {trial}" * bool(trial) + of + "*" * (row["driven on"] != "test")
-        ends = None if row["low"] is None else f"{row['low']:.2f}-{row['high']:.2f}"
-        use = f"{'load' if row['file'].endswith('.yaml') else 'run'} {row['file']}" * bool(
-            row["file"]
-        )
-        use = "change nothing" if row["what"] == "own parameters" else use or None
-        made = {"": what, "RTE [%]": row["error [%]"], "another drive": ends}
+        low, high, file, own = row["low"], row["high"], row["file"], row["what"] == "own parameters"
+        ends = None if low is None else "1" if low == high else f"{low:.2f}-{high:.2f}"
+        use = f"{'load' if file.endswith('.yaml') else 'run'} {file}" if file else None
+        use = "change nothing" if own else use
+        made = {"choice": what, "RTE [%]": row["error [%]"], "another drive": ends}
         made |= {"cost [ms]": row["cost [ms]"], "to drive it": use}
         cells.append(made | {"parameters": row["parameters"]})
     training = " * Error and cost are of training: it was not driven on the test."
     said = "Another drive: the error there, in times that of the odometry's own parameters, 95 %."
-    return Listing(title, cells, said + training * any("*" in row[""] for row in cells) + how)
+    return Listing(title, cells, said + training * any("*" in row["choice"] for row in cells) + how)
 
 
 def controls(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:

@@ -21,14 +21,14 @@ FILE = "verdict.json"
 
 def front_table(study: OfflineStudy, found: ComparedReplays) -> Listing:
     """What may be driven, and how."""
-    how, folder = f" Files are in {study.folder}", study.folder
+    metres, folder = f"{study.config.sub_trajectory:g} m", study.folder
+    how = f" RTE: mean error of the parts of the path that are {metres} long. Files: {folder}"
     own = None if study.fixed is None else study.own_file(study.fixed)
     if own is not None and own[0].exists():
         how += f"; fixed.yaml for the odometry's own tool: {own[0].name} ({own[1].use})"
     if any(row["mode"] == "adaptive" for row in found.front):
-        how += f". On a robot: `adaptune online {folder} --ros2 --mode adaptive`"
-    title = f"What may be driven, RTE over {study.config.sub_trajectory:g} m"
-    return tables.front_table(found.front, title, f"{how}.")
+        how += f". Adaptive, on a robot: `adaptune online {folder} --ros2 --mode adaptive`"
+    return tables.front_table(found.front, f"What each choice gives over {metres}", f"{how}.")
 
 
 def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:

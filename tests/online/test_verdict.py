@@ -92,7 +92,7 @@ def test_what_may_be_driven_by_cost():
     assert [row["recommended"] for row in alone] == [False, True, False]
     assert not any(row["recommended"] for row in choices(rows, front(), "none"))
     table = front_table(found, "title", " How.")
-    assert [row[""] for row in table.rows] == [
+    assert [row["choice"] for row in table.rows] == [
         "own parameters",
         "no more CPU time: trial 3*",
         "-> within the budget: trial 7",

@@ -48,7 +48,9 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     assert done.exit_code == 3, done.output
     assert "WORSE: bad.yaml against good.yaml, 3 recordings: error x" in done.stdout
     data = json.loads((bags / "out/verdict.json").read_text())
-    assert data["verdict"] == "worse"
+    assert data["verdict"] == data["action"] == "worse"
+    assert (data["odometry"], data["mode"]) == ("fake_odometry:Fake", "baseline")
+    assert data["ratio"] > data["interval"][0] > 1.0
     errors = [row for row in data["rows"] if row["quantity"] == "error"]
     assert [row["recording"] for row in errors] == ["drive_a", "drive_b", "drive_c", "all"]
     assert all(row["ratio"] > 1.05 for row in errors)
@@ -59,7 +61,9 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     # Another file of the same values is driven anew, and equal bit by bit.
     done = gate("same", "good", "--out", "out")
     assert done.exit_code == 0, done.output
-    rows = json.loads((bags / "out/verdict.json").read_text())["rows"]
+    data = json.loads((bags / "out/verdict.json").read_text())
+    assert data["action"] == "pass"
+    rows = data["rows"]
     assert {row["ratio"] for row in rows if row["quantity"] == "error"} == {1.0}
 
 
