@@ -7,6 +7,7 @@ import numpy as np
 
 from adaptune.archive import FIRST_POSE, PREPARE_MS, REGISTER_MS, Archive
 from adaptune.errors import AdaptuneError, nearest
+from adaptune.report.tables import Listing
 from adaptune.space import ODOMETRY, in_words
 
 Row = dict[str, Any]
@@ -114,3 +115,19 @@ def _short(row: Row) -> Row:
     short = {"trial": row["trial"], ODOMETRY: parameters.pop(ODOMETRY)}
     short["parameters"] = in_words(parameters)
     return short | {key: row[key] for key in keys[last:]}
+
+
+def by_odometry(table: Sequence[Row]) -> Listing | None:
+    """Of several odometries, what each has with its own parameters and tuned, the best first."""
+    rows = []
+    for label in dict.fromkeys(row.get(ODOMETRY) for row in table):
+        mine = [row for row in table if row.get(ODOMETRY) == label]
+        known = [row for row in mine if row["mean"] is not None]
+        best = min(known, key=lambda row: row["mean"], default={})
+        # The first trial of each has its own parameters.
+        one = {"odometry": label, "its own parameters [%]": mine[0]["mean"]}
+        one |= {"tuned [%]": best.get("mean"), "trial": best.get("trial")}
+        rows.append(one | {"cost [ms]": best.get("cost [ms]", best.get("cost"))})
+    rows.sort(key=lambda row: np.inf if row["tuned [%]"] is None else row["tuned [%]"])
+    title = "RTE of each odometry in training, over parts of the recordings"
+    return Listing(title, rows) if len(rows) > 1 else None

@@ -54,11 +54,18 @@ def worse_without(blocks: BlockErrors) -> NDArray[np.bool_]:
     return np.asarray(surely_worse(blocks) | (lost > lost[blocks.baseline]))
 
 
-def bare_in_words(
-    archive: Archive, whole: Finished, fixed: int, dropped: Sequence[int]
-) -> list[str]:
-    """What fixed set and baseline do without the health check, if that is another thing."""
-    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed, *dropped], bare=True)
+def driven_bare(archive: Archive, names: Sequence[str], trials: Sequence[int]) -> list[int]:
+    """Those of some trials that drove a whole recording without the health check."""
+    bare = read_whole_drives(archive, names, trials, bare=True)
+    return [n for n in trials if any(n in of for of in bare.values())]
+
+
+def bare_in_words(archive: Archive, whole: Finished, fixed: int, worse: Sequence[int]) -> list[str]:
+    """What fixed set and baseline do without the health check, if that is another thing.
+
+    Others are `worse`: they were left out because of what they do so.
+    """
+    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed, *worse], bare=True)
     if not any(bare.values()):
         return []
     base, of_fixed = (
@@ -70,7 +77,6 @@ def bare_in_words(
     driven = all(fixed in bare[name] or not of[fixed].restarts for name, of in whole.items())
     if fixed != BASELINE and driven:
         said += f", the fixed set {of_fixed:.3f} %"
-    # Others were dropped because they did not drive.
-    if worse := [n for n in dropped if any(n in of for of in bare.values())]:
+    if worse:
         said += f"; surely worse, and not recommended: trial {', '.join(map(str, worse))}"
     return [f"{said}."]

@@ -181,6 +181,20 @@ def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
     return np.where(usable, bound, np.inf)
 
 
+def why_not(blocks: BlockErrors, trial: int, fixed: int) -> str:
+    """Why `choose` prefers the fixed set to another one, in words."""
+    k, own = list(blocks.trials).index(trial), blocks.baseline
+    if surely_restarted(blocks)[k]:
+        n, base = (f"{blocks.restarts[column]:g}" for column in (k, own))
+        return f"the health check restarts it more often ({n} against {base} of the baseline)"
+    for what, errors in (("", blocks.errors), (" in rotation", blocks.turns)):
+        if errors is not None and surely_worse(blocks._replace(errors=errors))[k]:
+            return f"it is surely worse than the odometry's own parameters{what} on a recording"
+    bound = bounds(blocks)
+    mine, other = (f"{bound[list(blocks.trials).index(one)]:.2f}" for one in (trial, fixed))
+    return f"its error is less sure (by its bound {mine} times the baseline's, against {other})"
+
+
 def choose(blocks: BlockErrors, budget: float | None = None) -> int:
     """Trial number of the fixed set: that with the least bound within a budget, see `affordable`.
 
@@ -250,10 +264,10 @@ class Front(NamedTuple):
     """What CPU time buys: trial numbers."""
 
     own: int  # the baseline
-    equal_cost: int  # the best at no more than its cost
     fixed: int  # the best within the budget
+    equal_cost: int  # the best at no more than the baseline's cost
+    any_cost: int  # the best at any cost that keeps up
     below: int  # the best where the soft edge of the budget lies as much below it
-    best: int  # the best at any cost that keeps up
 
 
 def front(blocks: BlockErrors, budget: float | None) -> Front:
@@ -263,7 +277,7 @@ def front(blocks: BlockErrors, budget: float | None) -> Front:
     known = np.isfinite(base)
     equal = choose(blocks, EDGE * base) if known else fixed
     below = choose(blocks, USUAL_BUDGET * base / EDGE) if known and budget is None else fixed
-    return Front(blocks.trials[blocks.baseline], equal, fixed, below, best)
+    return Front(blocks.trials[blocks.baseline], fixed, equal, best, below)
 
 
 def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import islice
 from typing import Any
 
@@ -14,7 +14,8 @@ from adaptune.model import ErrorModel
 from adaptune.odometry.tracker import Tracker
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
-from adaptune.space import in_words
+from adaptune.space import ODOMETRY, in_words
+from adaptune.study.study import FIXED_SET, MODEL
 from offline.choice import (
     MOST_OF_PERIOD,
     Elsewhere,
@@ -22,37 +23,42 @@ from offline.choice import (
     bounds,
     elsewhere,
     mean_and_error,
+    why_not,
 )
 from offline.config import OfflineStudy
 from offline.labelled import LabelledData
 
 COST = "cost [ms]"
 """Column of CPU time a scan, preparation included."""
-OWN, EQUAL, FIXED = "own parameters", "no more CPU time", "within the budget"
-"""What rows of the front are; one set may be several of them."""
+OWN, FIXED, EQUAL = "own parameters", "within the budget", "no more CPU time"
+"""What rows of the front are; one set may be several of them, in this order."""
 BELOW, ANY, BANK = "just below the budget", "any CPU time", "adaptive"
+FILES = {FIXED: FIXED_SET, EQUAL: "equal_cost.yaml", ANY: "any_cost.yaml", BANK: MODEL}
+"""Where the parameters of such rows are."""
 
 
-def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
+def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> list[dict[str, Any]]:
     """Error over cost, by rising cost: the baseline, the best sets at several costs, and the bank.
 
     Errors are those of drives of whole recordings in training. Ratios to the baseline's are those
-    to expect on another drive, with intervals of 95 %.
+    to expect on another drive, with intervals of 95 %. The sentence on what was `left_out` stands
+    in the row of what is recommended.
     """
     blocks, front = data.driven_blocks(), data.front()
     means, _ = mean_and_error(blocks.errors, blocks.sequence)
     of_bounds = dict(zip(blocks.trials, bounds(blocks).tolist(), strict=True))
     costs = data.beside or data.costs
     roles: dict[int, list[str]] = {}
-    for what, trial in zip((OWN, EQUAL, FIXED, BELOW, ANY), front, strict=True):
+    for what, trial in zip((OWN, FIXED, EQUAL, ANY, BELOW), front, strict=True):
         if what != BELOW or trial not in roles:
             roles.setdefault(trial, []).append(what)
     rows = []
     for trial, names in roles.items():
         error, ratio = means[list(blocks.trials).index(trial)], elsewhere(blocks, trial)
-        row = _row(", ".join(names), error, costs.alone(trial), ratio) | {
+        row = _row(names, error, costs.alone(trial), ratio) | {
             "recommended": trial == model.fixed and model.recommended != BANK,
             "parameters": in_words(data.sets[trial]),
+            "odometry": data.sets[trial].get(ODOMETRY, ""),
         }
         rows.append(row | {"trial": trial, "_bound": of_bounds[trial]})
     members = [trial for trial in model.bank if trial not in model.reserve]
@@ -62,16 +68,61 @@ def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
         wider = np.log(np.array([of_bank["low"], of_bank["high"]]) / by)
         ends = np.hypot(np.log(np.array(fixed[1:]) / fixed.ratio), wider) * (-1.0, 1.0)
         ratio = Elsewhere(by * fixed.ratio, *(by * fixed.ratio * np.exp(ends)).tolist())
-        row = _row(BANK, error, costs.adaptive(members), ratio)
+        row = _row([BANK], error, costs.adaptive(members), ratio)
         row |= {"recommended": model.recommended == BANK}
-        trials = f"trials {', '.join(map(str, members))}"
-        rows.append(row | {"parameters": trials, "trial": None, "_bound": None})
+        row |= {"parameters": f"trials {', '.join(map(str, members))}", "odometry": ""}
+        rows.append(row | {"trial": None, "_bound": None})
+    rows = [row | {"left out": left_out if row["recommended"] else ""} for row in rows]
     return sorted(rows, key=lambda row: row[COST])
 
 
-def _row(what: str, error: float, cost: float, ratio: Elsewhere) -> dict[str, Any]:
-    row = {"what": what, "error [%]": float(error), COST: cost, "vs baseline": ratio.ratio}
-    return row | {"low": ratio.low, "high": ratio.high}
+def _row(roles: Sequence[str], error: float, cost: float, ratio: Elsewhere) -> dict[str, Any]:
+    row = {"what": ", ".join(roles), "error [%]": float(error), COST: cost}
+    row |= {"vs baseline": ratio.ratio, "low": ratio.low, "high": ratio.high}
+    return row | {"file": next((FILES[role] for role in roles if role in FILES), "")}
+
+
+AS_GOOD, CHEAPER = 1.01, 0.9
+"""Times the error and the cost of what is recommended up to which a set is no worse, and times
+their product below which it is better."""
+
+
+def left_out(
+    every: LabelledData, data: LabelledData, model: ErrorModel, worse: Collection[int]
+) -> str:
+    """Why the best set that is better and cheaper than what is recommended is not, in a sentence.
+
+    `every` has all sets, `data` those that may be chosen with their drives of whole recordings;
+    those that are `worse` drive them badly without the health check.
+    """
+    costs, bank = data.beside or every.costs, model.recommended == BANK
+    whole = data.driven_blocks()
+    for tried in (whole, every.blocks()):
+        if not len((blocks := tried.tracked()).errors):
+            return ""
+        means, _ = mean_and_error(blocks.errors, blocks.sequence)
+        errors = means / means[list(blocks.trials).index(model.fixed)]
+        ms = np.array([costs.alone(trial) for trial in blocks.trials])
+        if bank:
+            errors /= model.expected["geometric"]
+            ms /= costs.adaptive(t for t in model.bank if t not in model.reserve)
+        else:
+            ms /= costs.alone(model.fixed)
+        dominates = (errors <= AS_GOOD) & (ms <= AS_GOOD) & (errors * ms < CHEAPER)
+        if dominates.any():
+            k = int(np.argmin(np.where(dominates, errors * ms, np.inf)))
+            trial = blocks.trials[k]
+            if trial in worse:
+                why = "along whole recordings, without the health check, it is surely worse"
+            elif tried is not whole and trial in whole.trials:
+                why = "along whole recordings it is not better"
+            else:
+                why = why_not(blocks, trial, model.fixed)
+            return (
+                f"Trial {trial}, with {errors[k]:.2f} times the error for {ms[k]:.2f} times the "
+                f"CPU time in training, is left out: {why}."
+            )
+    return ""
 
 
 def elsewhere_in_words(rows: Sequence[dict[str, Any]]) -> str:

@@ -4,6 +4,7 @@ import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from adaptune.study.references import (
     estimates_of,
 )
 from adaptune.study.study import FIXED_SET
-from offline.bare import bare_in_words, in_whole_drives
+from offline.bare import bare_in_words, driven_bare, in_whole_drives
 from offline.campaign import (
     Campaign,
     Schedule,
@@ -43,7 +44,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import COST, elsewhere_in_words, front_rows
+from offline.front import ANY, COST, EQUAL, FILES, elsewhere_in_words, front_rows, left_out
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -127,13 +128,16 @@ def train(
             sets = {n: every_set[n] for n in sorted({*data.finalists(), *every_set.defaults})}
             drive_whole(study, sets, archive, workers, progress)
 
-        usable = in_whole_drives(data.usable(), archive, config, drive)
+        judged = data.usable()
+        usable = in_whole_drives(judged, archive, config, drive)
     whole = read_whole_drives(archive, names, [*usable.finalists(), *every_set.defaults])
     fixed = usable.fixed()
-    dropped = sorted({*data.usable().sets} - {*usable.sets})
+    dropped = sorted({*judged.sets} - {*usable.sets})
     data = data._replace(costs=(usable.beside or data.costs).without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
-    write_sets(study, every_set[fixed], every_set[usable.front().equal_cost])
+    chosen = usable.front()
+    others = {EQUAL: every_set[chosen.equal_cost], ANY: every_set[chosen.any_cost]}
+    write_sets(study, every_set[fixed], others)
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
@@ -148,8 +152,10 @@ def train(
     )
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    said += bare_in_words(archive, whole, fixed, dropped)
-    rows_of_front = front_rows(usable, model)
+    # Others were dropped because they did not drive.
+    worse = driven_bare(archive, names, dropped)
+    said += bare_in_words(archive, whole, fixed, worse)
+    rows_of_front = front_rows(usable, model, left_out(judged, usable, model, worse))
     tables.write_rows(study.folder, "front", rows_of_front)
     failed = [*unread_in_words(finished), *failed_in_words(verdicts)]
     return Training(model, trials, rows, said, failed, rows_of_front)
@@ -196,12 +202,15 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
 
 
 def write_sets(
-    study: OfflineStudy, fixed: ParameterSet, equal_cost: ParameterSet | None = None
+    study: OfflineStudy,
+    fixed: ParameterSet,
+    others: Mapping[str, ParameterSet] = MappingProxyType({}),
 ) -> None:
     """Write the fixed set (``fixed.yaml``), and again as its odometry's own tool reads it, if any.
 
-    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed. The best
-    set that costs no more than the baseline is ``equal_cost.yaml``, unless it is the fixed set.
+    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed. Of the
+    `others`, the best at no more CPU time and at any, each has its file, see `FILES`, unless it is
+    the fixed set.
     """
     own = study.own_file(fixed)
     ours = {f"fixed_{name}" for name in (*ODOMETRIES, *PROGRAMS)}
@@ -211,11 +220,12 @@ def write_sets(
     write_text(study.folder / FIXED_SET, yaml12.dump(fixed))
     if own is not None:
         write_text(own[0], own[1].text)
-    path = study.folder / "equal_cost.yaml"
-    if equal_cost is not None and equal_cost != fixed:
-        write_text(path, yaml12.dump(equal_cost))
-    else:
-        path.unlink(missing_ok=True)
+    for role in (EQUAL, ANY):
+        path = study.folder / FILES[role]
+        if others.get(role, fixed) != fixed:
+            write_text(path, yaml12.dump(others[role]))
+        else:
+            path.unlink(missing_ok=True)
 
 
 def trial_workers(

@@ -24,6 +24,7 @@ from adaptune.study.study import Study
 from online.modes import (
     BASELINE,
     EVEN,
+    FIXED,
     UNTRAINED,
     WITHOUT_MODEL,
     ReplaySetup,
@@ -42,17 +43,8 @@ from online.statistics import (
     mean_of,
     oracle_row,
 )
-from online.tables import last_rows, tables
-from online.verdict import (
-    CALLED,
-    adapts,
-    called,
-    decided,
-    error_and_cost,
-    late,
-    remarks,
-    verdict,
-)
+from online.tables import tables
+from online.verdict import adapts, called, choices, decided, late, remarks, verdict
 
 
 class ComparedModes(NamedTuple):
@@ -281,6 +273,8 @@ class ComparedReplays(NamedTuple):
     details: list[str]  # sentences: what must be known to trust it
     advised: str = ""  # the mode to drive, or `NONE`; empty where nobody can say
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
+    front: Sequence[dict[str, Any]] = ()  # what may be driven, see `choices`
+    model: ErrorModel | None = None  # of the replays
 
 
 def compare(study: Study) -> ComparedReplays:
@@ -315,6 +309,8 @@ def compare(study: Study) -> ComparedReplays:
             periods[name] = 1e-6 * float(np.median(np.diff(stamps)))
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, replays, reference)
+        if model is not None and model.fixed == rules.BASELINE:
+            of_modes = of_modes._replace(rows=_of_one_set(of_modes.rows))
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         if model is not None:
             errors = oracle_errors(study.archive("oracle"), name, model)
@@ -329,25 +325,30 @@ def compare(study: Study) -> ComparedReplays:
     best = decided(rows, recommended)
     said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:
-        said = _lost(study, rows, best, model)
+        said = _lost(study, rows, best)
         advised = NONE if said else advised
+    front = choices(rows, _front(study, model), advised, obstacle)
     if advised != NONE:
-        said += verdict(rows, length, recommended, _front(study, model), obstacle)
+        said += verdict(rows, length, recommended, front, obstacle)
         said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
-    return ComparedReplays(rows, said, details, advised, compared.unfinished)
+    return ComparedReplays(rows, said, details, advised, compared.unfinished, front, model)
 
 
-def _lost(
-    study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow, model: ErrorModel | None
-) -> list[str]:
-    """Where what is advised has lost its way, the likeliest cause, and what errs least."""
-    known = [row for row in rows if row.rte is not None]
-    of_best = [row for row in known if row.mode == best.mode and row.sequence != ALL]
+def _of_one_set(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+    """The same where baseline and fixed set are one: what it costs is the mean of both drives."""
+    both = (BASELINE, FIXED)
+    cost = mean_of([row.cpu_ms for row in rows if row.mode in both])
+    return [replace(row, cpu_ms=cost) if row.mode in both else row for row in rows]
+
+
+def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> list[str]:
+    """Where what is advised has lost its way, and the likeliest cause."""
+    of_best = [row for row in rows if row.mode == best.mode and row.sequence != ALL]
     said = lost_in_words(
         called(best.mode),
         {row.sequence: row.rte for row in of_best if row.rte is not None},
@@ -355,17 +356,7 @@ def _lost(
         lambda worst: hard_to_track(study.sequences.open(worst)),
         [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
     )
-    if said:
-        judge = " by an estimated reference" * any(row.reference == "estimated" for row in known)
-        tried = [row for row in last_rows(known) if row.mode in CALLED]
-        each = [
-            f"{CALLED[row.mode]} {error_and_cost(row)}"
-            for row in sorted(tried, key=lambda row: row.rte or 0.0)
-        ]
-        length = f"{study.config.sub_trajectory:g} m"
-        said.append(f"Until then, rely on none: RTE over {length}{judge}, {', '.join(each)}.")
-        said += [] if model is None else _of_training(model)
-    return said
+    return [*said, "Until then, rely on none."] if said else []
 
 
 def _of_estimates(study: Study, model: ErrorModel) -> list[str]:
@@ -391,19 +382,8 @@ def _front(study: Study, model: ErrorModel | None) -> list[dict[str, Any]]:
     if model is None or not path.exists():
         return []
     rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
-    known = all({"what", "trial", "recommended", "low", "high"} <= row.keys() for row in rows)
-    return rows if known else []
-
-
-def _of_training(model: ErrorModel) -> list[str]:
-    """The best set in training, where it keeps track there and costs more than the fixed one."""
-    means = rules.mean_errors(model.errors, model.sequence)
-    trial = model.sets.trials[int(np.argmin(means))]
-    costs = [np.nan if model.costs is None else model.costs.alone(t) for t in (trial, model.fixed)]
-    if not means.min() <= LOST_ABOVE or not costs[0] > costs[1]:
-        return []
-    has = f"trial {trial} has {means.min():.2f} % at {costs[0]:.0f} ms a scan"
-    return [f"In training {has}: `online.budget: {np.ceil(costs[0]):.0f}` allows it."]
+    # Older ones are of another kind.
+    return rows if all("left out" in row for row in rows) else []
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

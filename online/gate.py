@@ -105,6 +105,8 @@ class Gate(NamedTuple):
     verdict: Verdict
     rows: list[GateRow]
     words: str  # in one line
+    odometry: str  # the new side's
+    mode: str  # in which both were driven
 
 
 def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
@@ -283,7 +285,8 @@ def compare_sides(
     rows += [_restarts(pairs, share), *_lacking(pairs)]
     verdict = _overall(rows)
     left_out = f" Not compared: {shared.alone}." if shared.alone else ""
-    return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out)
+    words = _in_words(shared, verdict, rows) + left_out
+    return Gate(verdict, rows, words, shared.new.study.odometry.name, shared.mode)
 
 
 def _rows(
@@ -390,9 +393,20 @@ def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
 
 
 def write_gate(folder: Path, gate: Gate) -> None:
-    """Write ``gate.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
-    data = {"verdict": gate.verdict, "words": gate.words, "rows": [r._asdict() for r in gate.rows]}
-    write_text(folder / "gate.json", json.dumps(data, indent=1) + "\n")
+    """Write ``verdict.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
+    # Of the error over all, which comes last.
+    error = [row for row in gate.rows if row.quantity == ERROR][-1]
+    data = {
+        "action": gate.verdict if gate.verdict in ("worse", "unclear") else "pass",
+        "verdict": gate.verdict,
+        "odometry": gate.odometry,
+        "mode": gate.mode,
+        "ratio": error.ratio,
+        "interval": [error.low, error.high],
+        "why": [gate.words],
+        "rows": [row._asdict() for row in gate.rows],
+    }
+    write_text(folder / "verdict.json", json.dumps(data, indent=1) + "\n")
     suite = Xml.Element("testsuite", name="adaptune compare", tests=str(len(gate.rows)))
     for row in gate.rows:
         case = Xml.SubElement(suite, "testcase", classname=row.recording, name=row.quantity)

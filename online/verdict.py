@@ -4,7 +4,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from adaptune.model.registry import ADAPTIVE
 from adaptune.paired import Ratio
+from adaptune.study.study import FIXED_SET, MODEL
 from online.modes import BASELINE, EVEN, FIXED, MODES, UNTRAINED
 from online.statistics import ALL, ORACLE, ComparisonRow
 from online.tables import YARDSTICKS, last_rows
@@ -38,12 +40,17 @@ def decided(rows: Sequence[ComparisonRow], recommended: str = FIXED) -> Comparis
         better = bank is not None and FIXED not in last and _to_baseline(bank).interval
         return bank if better and better[1] < 1.0 else one or base
     ends = _to_baseline(one).interval
-    return base if ends is not None and ends[0] > 1.0 else one
+    return base if (ends is not None and ends[0] > 1.0) or _is_baseline(one) else one
 
 
 def _to_baseline(row: ComparisonRow) -> Ratio:
     """Ratio of a mode's error to the baseline's."""
     return row.against.get(BASELINE, _ratio(row) if row.yardstick == BASELINE else Ratio(math.nan))
+
+
+def _is_baseline(row: ComparisonRow) -> bool:
+    """Whether a mode drove as the baseline did: with its set."""
+    return row.mode == FIXED and abs(_to_baseline(row).value - 1.0) < ROUNDING
 
 
 def adapts(mode: str) -> bool:
@@ -67,6 +74,50 @@ def called(mode: str) -> str:
     return CALLED.get(mode, f"`{mode}`")
 
 
+def choices(
+    rows: Sequence[ComparisonRow],
+    front: Sequence[Mapping[str, Any]],
+    best: str = "",
+    obstacle: str = "",
+) -> list[dict[str, Any]]:
+    """What may be driven, by rising cost: the best of each budget, and the bank.
+
+    Error and cost are those of the test, or of training where it was not driven on the test.
+    `front` has the rows of training, see `offline.front.front_rows`; `best` is the mode to drive.
+    """
+    last, found, told = _judged(rows), list[dict[str, Any]](), set[str]()
+    for row in front:
+        if row["what"] == "just below the budget" or (row["trial"] is None and obstacle):
+            continue
+        modes = [ADAPTIVE] * (row["trial"] is None) + [BASELINE] * (row["trial"] == 0)
+        modes += [FIXED] * ("within the budget" in row["what"])
+        told |= {*modes}
+        found.append(dict(row) | {"what": row["what"].split(", ")[0], "mode": "", _ON: "training"})
+        found[-1] |= next((_driven(last[mode]) for mode in modes if mode in last), {})
+        found[-1]["recommended"] = best in modes
+    for mode, (what, file) in _ALONE.items():
+        # Of several odometries, the first one's own parameters may be no row of the front.
+        if mode in last and mode not in told and (mode in (best, ADAPTIVE) or not front):
+            one = {"what": what, "file": file, "recommended": mode == best, **_driven(last[mode])}
+            one |= dict.fromkeys(("trial", "low", "high"))
+            found.append(one | dict.fromkeys(("odometry", "parameters", "left out"), ""))
+    return sorted(found, key=lambda row: math.inf if row[_COST] is None else row[_COST])
+
+
+_ON, _ERROR, _COST = "driven on", "error [%]", "cost [ms]"
+_ALONE = {
+    BASELINE: ("own parameters", ""),
+    FIXED: ("within the budget", FIXED_SET),
+    ADAPTIVE: (ADAPTIVE, MODEL),
+    UNTRAINED: ("bank without a model", ""),
+}
+"""What modes are that training does not know, and their files."""
+
+
+def _driven(row: ComparisonRow) -> dict[str, Any]:
+    return {"mode": row.mode, _ON: "test", _ERROR: row.rte, _COST: row.cpu_ms}
+
+
 def verdict(
     rows: Sequence[ComparisonRow],
     length: float,
@@ -77,8 +128,8 @@ def verdict(
     """What to do, and why, in at most five sentences.
 
     Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres.
-    Training recommends a mode, and knows the `front`, see `offline.front.front_rows`; `obstacle`
-    says why nothing adapts.
+    Training recommends a mode; the `front` is that of `choices`; `obstacle` says why nothing
+    adapts.
     """
     last = _judged(rows)
     if (best := decided(rows, recommended)) is None:
@@ -90,42 +141,45 @@ def verdict(
                 f"{' and '.join(judged)} (test a longer part, or lower sub_trajectory)"
             )
         return [f"{nobody}: nobody can say what was gained.", *_estimates(rows)[:2]]
+    own = next((row for row in front if row["recommended"]), None)
+    trial, base = None if own is None else own["trial"], last.get(BASELINE)
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
-    where = f"RTE over {length:g} m, {_where(rows)}{judge}"
-    own = next((row for row in front if row["trial"] is not None and row["recommended"]), None)
-    base = last.get(BASELINE)
-    if best is base or (best.mode == FIXED and own is not None and own["trial"] == 0):
-        said = [f"Keep {CALLED[BASELINE]}: {error_and_cost(best)}, {where}."]
+    where = f"(RTE over {length:g} m, {_where(rows)}{judge})"
+    if best is base:
+        said = [f"Keep {CALLED[BASELINE]}: {_error_and_cost(best)} {where}."]
         said += _why_kept(best, last, recommended)
     else:
-        trial = f" (trial {own['trial']})" if best.mode == FIXED and own is not None else ""
-        what = f"Drive {called(best.mode)}{trial}: {error_and_cost(best)}"
-        if base is not None:
-            what += f" instead of {error_and_cost(base)} with {CALLED[BASELINE]}"
-        said = [f"{what}, {where}{_sure(best, base, front)}."]
-    said += _bought(best, front)
-    main = last.get("adaptive")
-    if main is not None and main is not best:
-        against = f": {_ratio(main).value:.2f} times the {YARDSTICKS[main.yardstick]}'s error"
-        interval = f" ({_interval(_ratio(main))})"
-        said.append(f"With cores to spare: adaptive, {error_and_cost(main)}{against}{interval}.")
-    elif main is None and obstacle:
+        what = called(best.mode) + (f" (trial {trial})" if best.mode == FIXED and trial else "")
+        said = [f"Drive {what}: {_gained(best, base, where, own)}."]
+    if bank := last.get(ADAPTIVE):
+        first = "Adapting: " if bank is best else "With cores to spare: adaptive, "
+        same = FIXED in last and _is_baseline(last[FIXED])
+        said.append(f"{first}{_to_yardstick(bank, last, 'their' if same else '')}.")
+    elif obstacle:
         said.append(f"Nothing adapts: {obstacle}.")
-    return [*said, *_other_rules(best, last)]
+    said += [own["left out"]] if own and own["left out"] else []
+    rules = (row for row in _adapting(last) if row not in (best, bank))
+    return said + [f"`{row.mode}` had {_to_yardstick(row, last)}." for row in rules]
 
 
-def _sure(
-    best: ComparisonRow, base: ComparisonRow | None, front: Sequence[Mapping[str, Any]]
+def _error_and_cost(row: ComparisonRow) -> str:
+    return f"{row.rte:.3f} %" + (f" at {row.cpu_ms:.1f} ms a scan" if row.cpu_ms else "")
+
+
+def _gained(
+    best: ComparisonRow, base: ComparisonRow | None, where: str, own: Mapping[str, Any] | None
 ) -> str:
-    """How sure the ratio to the baseline is, and what to expect on another drive."""
+    """What is advised instead of the baseline, here and on another drive."""
+    if base is None:
+        return f"{_error_and_cost(best)} {where}"
+    said = f"{best.rte:.3f} % instead of {base.rte:.3f} % with {CALLED[BASELINE]}"
+    if best.cpu_ms and base.cpu_ms:
+        said += f", for {best.cpu_ms:.1f} instead of {base.cpu_ms:.1f} ms a scan"
     ratio = _to_baseline(best)
-    if base is None or abs(ratio.value - 1.0) < ROUNDING:
-        return ""
-    said = f": {ratio.value:.2f} times its error ({_interval(ratio)})"
-    for row in front:
-        if row["recommended"]:
-            said += f"; on another drive, {_end(row['low'])} to {_end(row['high'])} times"
-    return said
+    said += f" {where}: {ratio.value:.2f} times the error ({_interval(ratio)})"
+    if own is None or own["low"] is None:
+        return said
+    return f"{said}; on another drive, {_end(own['low'])} to {_end(own['high'])} times"
 
 
 def _why_kept(
@@ -133,7 +187,7 @@ def _why_kept(
 ) -> list[str]:
     """Why the odometry's own parameters are kept."""
     other = last.get(recommended)
-    if other is None or other is best or abs(_to_baseline(other).value - 1.0) < ROUNDING:
+    if other is None or other is best or _is_baseline(other):
         return ["In training, no set within the budget was safely better."] * (FIXED in last)
     ratio = _to_baseline(other)
     return [
@@ -142,27 +196,14 @@ def _why_kept(
     ]
 
 
-def _bought(best: ComparisonRow, front: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What less and more CPU time than that of what is advised buys, by training."""
-    said = []
-    for what, words in _BUDGETS.items():
-        row = next((row for row in front if what in row["what"]), None)
-        if row is None or row["trial"] is None or row["recommended"] or not row["trial"]:
-            continue
-        ends = f"{_end(row['low'])} to {_end(row['high'])}"
-        said.append(
-            f"{words}: trial {row['trial']}, {row['error [%]']:.3f} % at {row['cost [ms]']:.1f} ms "
-            f"in training, on another drive {ends} times the error of {CALLED[BASELINE]}."
-        )
-    return said[: 2 if best.mode != "adaptive" else 1]
+def _to_yardstick(row: ComparisonRow, last: Mapping[str, ComparisonRow], whose: str = "") -> str:
+    """Error and CPU time of a mode, in times those of the fixed set, or the baseline."""
+    whose, other = whose or f"the {YARDSTICKS[row.yardstick]}'s", last[row.yardstick].cpu_ms
+    said = f"{_ratio(row).value:.2f} times {whose} error ({_interval(_ratio(row))})"
+    times = f", for {row.cpu_ms / other:.1f} times the CPU time" if row.cpu_ms and other else ""
+    return said + times
 
 
-_BUDGETS = {
-    "no more CPU time": "At no more CPU time",
-    "within the budget": "Of single sets",
-    "any CPU time": "At any CPU time",
-}
-"""What rows of the front are, and how a sentence on them begins."""
 ROUNDING = 1e-6
 """A ratio that differs less from 1 is 1."""
 
@@ -175,28 +216,6 @@ def late(rows: Sequence[ComparisonRow], mode: str, periods: Mapping[str, float])
             every = f"On {row.sequence}, scans come every {period:.0f} ms"
             return [f"{every}: {row.cpu_ms:.0f} ms of CPU time a scan take several cores."]
     return []
-
-
-def error_and_cost(row: ComparisonRow) -> str:
-    """The error of a mode, and what it costs."""
-    return f"{row.rte:.3f} %" + (f" at {row.cpu_ms:.1f} ms a scan" if row.cpu_ms else "")
-
-
-def _other_rules(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
-    """How rules of the user's did."""
-    return [
-        f"`{row.mode}` had {_ratio(row).value:.2f} times the "
-        f"{YARDSTICKS[row.yardstick]}'s error ({_interval(_ratio(row))})"
-        f"{_for_cost(row, last[row.yardstick])}."
-        for row in _adapting(last)
-        if row is not best and row.mode != "adaptive"
-    ]
-
-
-def _for_cost(main: ComparisonRow, one: ComparisonRow) -> str:
-    if main.cpu_ms is None or not one.cpu_ms:
-        return ""
-    return f", for {main.cpu_ms / one.cpu_ms:.1f} times its CPU time ({main.cpu_ms:.1f} ms a scan)"
 
 
 def _where(rows: Sequence[ComparisonRow]) -> str:

@@ -22,7 +22,6 @@ from adaptune.commands.terminal import (
     load,
     progress,
     say,
-    say_fixed,
     say_next,
     say_next_of_study,
     show_table,
@@ -202,7 +201,7 @@ Unclear = Annotated[
     Literal["pass", "fail"], typer.Option(help="What too little to tell counts as.")
 ]
 Out = Annotated[
-    Path, typer.Option(help="Folder of gate.json, junit.xml and summary.md.", file_okay=False)
+    Path, typer.Option(help="Folder of verdict.json, junit.xml and summary.md.", file_okay=False)
 ]
 
 
@@ -315,7 +314,7 @@ def _gate(
     say(gate.words)
     metres = both[0].study.config.sub_trajectory
     show_table(f"New against old, RTE over {metres:g} m", [row.columns() for row in gate.rows])
-    say(f"Files: {out}/gate.json, junit.xml, summary.md")
+    say(f"Files: {out}/verdict.json, junit.xml, summary.md")
     if gate.verdict == "worse" or (gate.verdict == "unclear" and unclear == "fail"):
         raise typer.Exit(WORSE)
 
@@ -331,21 +330,20 @@ def _share_of(text: str, key: str) -> float:
 def say_compared(
     loaded: "OfflineStudy", found: "ComparedReplays", page: Path, *, details: bool = False
 ) -> None:
-    """Print what to do and a table; with `details`, all sentences and tables of the page."""
-    from adaptune.model.registry import ADAPTIVE
-    from online.modes import BASELINE, FIXED
-    from online.tables import decision_table, tables
+    """Print what to do and what may be driven; with `details`, all that is on the page."""
+    from adaptune.tuning.verdict import front_table
+    from online.tables import controls, tables
 
     length = loaded.config.sub_trajectory
     say(" ".join(found.verdict))
-    if found.rows[0].yardstick == "fixed":
-        same = (BASELINE,) if loaded.fixed == loaded.odometry.space.baseline else ()
-        say_fixed(loaded, advised=found.advised in ("", FIXED, ADAPTIVE, *same))
+    if found.front:
+        title, rows, caption = front_table(loaded, found)
+        few = [{key: row[key] for key in row if key != "parameters"} for row in rows]
+        show_table(title, few, caption)
     say(f"More: {page}")
-    shown = tables(found.rows, length) if details else [decision_table(found.rows, length)]
     for sentence in found.details if details else ():
         say(sentence)
-    for made in shown:
+    for made in tables(found.rows, length) if details else controls(found.rows, length):
         show_table(*made)
 
 

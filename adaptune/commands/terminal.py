@@ -59,15 +59,11 @@ def show_table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "")
     console.print(*tables_within(Listing(title, rows, caption), console.width), sep="\n")
 
 
-_ORDER = "own parameters, within the budget, no more CPU time, just below the budget, any CPU time"
-"""What a row of the front is called that is several of these."""
-
-
 def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> None:
     """The table of what CPU time buys."""
     shown = [
         {
-            "": "-> " * row["recommended"] + min(row["what"].split(", "), key=_ORDER.find),
+            "": "-> " * row["recommended"] + row["what"].split(", ")[0],
             **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
             "RTE [%]": row["error [%]"],
             "elsewhere": row["vs baseline"],
@@ -104,7 +100,7 @@ def progress() -> Iterator[Progress]:
         yield show
 
 
-def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
+def say_fixed(study: "OfflineStudy") -> None:
     """Say where the fixed set is, and where it is as the odometry's own tool reads it."""
     from adaptune.study.study import FIXED_SET
 
@@ -112,9 +108,8 @@ def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
     own = None if fixed is None else study.own_file(fixed)
     there = own is not None and own[0].exists()
     more = f"; for the odometry's own tool: {own[0]} ({own[1].use})" if own and there else ""
-    what = "The parameters" if advised else "The fixed set, which is not advised here"
-    what += ", all unchanged" * (fixed == study.odometry.space.baseline)
-    say(f"{what}: {study.folder / FIXED_SET}{more}.")
+    unchanged = ", all unchanged" * (fixed == study.odometry.space.baseline)
+    say(f"The parameters{unchanged}: {study.folder / FIXED_SET}{more}.")
 
 
 def say_next(why: str, *words: object, first: str = "") -> None:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
     from adaptune.tuning.tuned import Tuned
     from offline.config import OfflineStudy
-    from offline.train import Training
 
 
 def inspect(
@@ -270,6 +269,7 @@ def tune(
     when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
+    from adaptune.trial_rows import by_odometry
     from adaptune.tuning.studies import LACKING, proposed_system
     from adaptune.tuning.tuned import tune_asked
 
@@ -292,11 +292,13 @@ def tune(
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)
     for sentence in tuned.training.failed:
         say(sentence)
-    show_front(tuned.training.front, *BUYS)
+    if details:
+        show_front(tuned.training.front, *BUYS)
+        if odometries := by_odometry(tuned.training.trials):
+            show_table(*odometries)
     if tuned.more:
         _say_grown(tuned.more, tuned.before, tuned.fixed)
     _say_recordings(tuned)
-    say_odometries(tuned.study, tuned.training)
     say_next("replays to look at in Foxglove", "record", tuned.study.folder)
 
 
@@ -339,33 +341,3 @@ def _say_recordings(tuned: "Tuned") -> None:
         rows,
         "Recommended is the finalist that the others choose; for the test, the fixed set.",
     )
-
-
-def say_odometries(study: "OfflineStudy", training: "Training") -> None:
-    """Of several odometries, what each gives with its own parameters and tuned, in training."""
-    from adaptune.space import ODOMETRY
-    from offline.front import COST
-
-    labels = list(study.config.odometries)
-    if len(labels) < 2:
-        return
-    rows = []
-    for label in labels:
-        mine = [row for row in training.trials if row[ODOMETRY] == label]
-        known = [row for row in mine if row["mean"] is not None]
-        best = min(known, key=lambda row: row["mean"], default=None)
-        rows.append(
-            {
-                "odometry": label,
-                "its own parameters [%]": mine[0]["mean"] if mine else None,
-                "tuned [%]": None if best is None else best["mean"],
-                COST: None if best is None else best[COST],
-            }
-        )
-    rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))
-    fixed = training.model.sets[training.model.fixed][ODOMETRY]
-    say(
-        f"Best odometry in training: {rows[0]['odometry']}. On the test, the fixed set is "
-        f"{fixed}'s, the baseline {labels[0]}'s; to see another there, name it alone (--odometry)."
-    )
-    show_table("RTE of each odometry in training", rows)

@@ -11,6 +11,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.report.charts import Chart, Charts
 from adaptune.report.page import Page, PageSection, write_page
 from adaptune.report.tables import Listing
+from adaptune.tuning.verdict import front_table
 from offline.charts import charts_of_trials, charts_of_validation
 from offline.config import OfflineStudy, OfflineStudyConfig
 from online.charts import charts_of_comparison, charts_of_replays
@@ -43,6 +44,8 @@ def write_study_page(study: OfflineStudy, found: ComparedReplays | str) -> Path:
         f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
     )
     words = () if isinstance(found, str) else tuple(found.verdict)
+    if not isinstance(found, str) and found.front:
+        sections.insert(0, PageSection("What to drive", tables=(front_table(study, found),)))
     path = study.folder / "report" / "report.html"
     write_page(path, Page(study.name, subtitle, words, tuple(sections)))
     return path
@@ -71,7 +74,8 @@ def _search(study: OfflineStudy) -> PageSection:
     best = trial_rows.select([row for row in finished if row["mean"] is not None], "mean", top=50)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
     listed = trial_rows.with_units(best, study.training, study.odometry.space.labels)
-    return replace(section, tables=(Listing(title, listed),))
+    each = trial_rows.by_odometry(finished)
+    return replace(section, tables=(*([each] if each else ()), Listing(title, listed)))
 
 
 def _settings(config: OfflineStudyConfig) -> PageSection:

@@ -59,9 +59,10 @@ class Tuned:
     def front(self) -> Any:
         """What CPU time buys: a row for each choice, with its error and its cost.
 
-        These were driven from end to end; the errors of `trials` are of stretches.
+        Those of the test are from there, the others of whole drives in training; the errors of
+        `trials` are of stretches.
         """
-        return _table(self.training.front)
+        return _table(self.comparison.front)
 
     @property
     def trials(self) -> Any:
@@ -92,6 +93,7 @@ class Tuned:
         folder = self.study.folder
         named = {"study": folder / f"{folder.resolve().name}.yaml", "page": self.page}
         named |= {"fixed": folder / "fixed.yaml", "model": self.study.model_path}
+        named |= {"verdict": folder / "verdict.json"}
         named |= {"own": own[0]} if own else {}
         tables = ("trials", "front", "training", "comparison/comparison")
         named |= {Path(key).name: folder / f"{key}.csv" for key in tables}
@@ -262,8 +264,9 @@ def _folder(asked: Asked) -> Path:
 
 
 def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":
-    """Compare a study's replays, and write the page, which is there also if it still runs."""
+    """Compare a study's replays, and write the verdict, and the page, also of one that runs."""
     from adaptune.tuning.page import write_study_page
+    from adaptune.tuning.verdict import write_verdict
     from online.compare import compare
 
     try:
@@ -272,4 +275,5 @@ def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":
         if (study.folder / "study.yaml").exists():
             _log.warning("page: %s", write_study_page(study, f"No comparison: {error}."))
         raise
+    write_verdict(study, found)
     return found, write_study_page(study, found)

@@ -6,7 +6,7 @@ import pytest
 
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
-from adaptune.trial_rows import headings, rows, select, with_units
+from adaptune.trial_rows import by_odometry, headings, rows, select, with_units
 from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000
@@ -100,3 +100,19 @@ def test_selecting(arguments, numbers):
 def test_a_column_that_there_is_not_is_told():
     with pytest.raises(AdaptuneError, match=r"--sort means: .* did you mean 'mean'"):
         select(TABLE, "means")
+
+
+def test_each_of_several_odometries_has_a_row_the_best_first():
+    of = [("gicp", 4.0), ("ndt", 3.0), ("gicp", 2.0), ("ndt", 1.0), ("gicp", None), ("vgicp", None)]
+    table = [
+        {"trial": n, "odometry": name, "mean": mean, "cost": 10.0 + n}
+        for n, (name, mean) in enumerate(of)
+    ]
+    made = by_odometry(table)
+    assert made is not None
+    assert [list(row.values()) for row in made.rows] == [
+        ["ndt", 3.0, 1.0, 3, 13.0],
+        ["gicp", 4.0, 2.0, 2, 12.0],
+        ["vgicp", None, None, None, None],
+    ]
+    assert by_odometry([row for row in table if row["odometry"] == "ndt"]) is None

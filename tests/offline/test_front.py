@@ -2,12 +2,16 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from adaptune.errors import AdaptuneError
+from adaptune.model.rules import Costs, SetCost
+from offline.choice import BlockErrors
 from offline.config import load_study
-from offline.front import COST, OWN, elsewhere_in_words, measured_front, recommended
+from offline.front import COST, OWN, elsewhere_in_words, left_out, measured_front, recommended
 
 
 @pytest.fixture
@@ -58,3 +62,47 @@ def test_a_budget_decides_also_below_what_the_baseline_costs():
         (1.0, 100.0, 2),
     ):
         assert recommended(rows, budget, period)["trial"] == trial
+
+
+def told_of(**changes):
+    """What is told of trial 1, which has half of trial 2's error for half of its cost."""
+    errors = np.array([[1.0, 0.4, 0.8], [1.0, 0.4, 0.8]] * 6) * np.linspace(0.9, 1.1, 12)[:, None]
+    costs = np.array([10.0, 5.0, 10.0])
+    none = np.zeros(12, np.intp), costs, np.zeros(3)
+    blocks = BlockErrors([0, 1, 2], errors, *none)._replace(**changes.get("tried", {}))
+    driven = changes.get("driven", blocks.some([0, changes.get("fixed", 2)]))
+    of = Costs({n: SetCost(cost, 0.0, 0) for n, cost in enumerate(costs.tolist())}, 0.0)
+    data = SimpleNamespace(costs=of, beside=None, blocks=lambda: blocks)
+    whole = SimpleNamespace(costs=of, beside=None, driven_blocks=lambda: driven)
+    bank = {"bank": [0, 2], "reserve": [], "expected": {"geometric": changes.get("bank", 1.0)}}
+    mode = "adaptive" if "bank" in changes else "fixed"
+    model = SimpleNamespace(fixed=changes.get("fixed", 2), recommended=mode, **bank)
+    return left_out(data, whole, model, changes.get("worse", ()))
+
+
+def test_a_set_that_is_better_and_cheaper_is_named_with_the_reason():
+    said = told_of(tried={"restarts": np.array([1.0, 9.0, 0.0])})
+    assert said == (
+        "Trial 1, with 0.50 times the error for 0.50 times the CPU time in training, is left out: "
+        "the health check restarts it more often (9 against 1 of the baseline)."
+    )
+    turns = np.ones((12, 3))
+    turns[:, 1] = np.linspace(2.0, 2.1, 12)
+    assert "surely worse than the odometry's own parameters in rotation" in told_of(
+        tried={"turns": turns}
+    )
+    assert "along whole recordings, without the health check, it is surely worse" in told_of(
+        worse=[1]
+    )
+    errors = np.tile([1.0, 1.2, 1.0], (12, 1))
+    driven = BlockErrors([0, 1, 2], errors, np.zeros(12, np.intp), *np.zeros((2, 3)))
+    assert told_of(driven=driven).endswith("is left out: along whole recordings it is not better.")
+    varied = np.array([[1.0, 0.05, 0.8], [1.0, 1.2, 0.8]] * 6)
+    assert "its error is less sure (by its bound " in told_of(tried={"errors": varied})
+    assert "Trial 1, " in told_of(bank=0.6, worse=[1])
+
+
+def test_nothing_is_left_out_that_is_dearer_or_worse_or_where_nothing_tracks():
+    assert told_of(fixed=1) == ""
+    assert told_of(bank=0.4) == ""
+    assert told_of(tried={"lost_above": 0.1}) == ""

@@ -5,6 +5,7 @@ from adaptune import yaml12
 from adaptune.commands import terminal
 from adaptune.space import ODOMETRY
 from offline.config import load_study
+from offline.front import ANY, EQUAL, FILES
 from offline.train import write_sets
 
 ODOMETRIES = "odometry: [{name: gicp}, {name: kiss_icp}]\n"
@@ -23,8 +24,8 @@ def write(study, label, **parameters):
     assert yaml12.Document.of_file(study.folder / "fixed.yaml").data == fixed
 
 
-def said(study, capsys, **options):
-    terminal.say_fixed(study, **options)
+def said(study, capsys):
+    terminal.say_fixed(study)
     (line,) = capsys.readouterr().out.splitlines()
     return line
 
@@ -40,18 +41,17 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     # Of a study that was trained before there was such a file.
     own.unlink()
     assert said(study, capsys) == f"{alone}."
-    write(study, "kiss_icp", voxel_size=0.7)
-    assert "which is not advised here" in said(study, capsys, advised=False)
     write(study, "gicp")
     assert sorted(study.folder.glob("fixed*")) == [study.folder / "fixed.yaml", users]
     none = f"The parameters, all unchanged: {study.folder}/fixed.yaml."
     assert said(study, capsys) == none
 
 
-def test_the_best_at_no_more_cost_is_written_and_goes(study):
-    fixed = study.odometry.space.baseline
-    write_sets(study, fixed, {"odometry": "gicp", "downsampling": 0.1})
-    path = study.folder / "equal_cost.yaml"
-    assert yaml12.Document.of_file(path).data == {"odometry": "gicp", "downsampling": 0.1}
-    write_sets(study, fixed, fixed)
-    assert not path.exists()
+def test_the_best_at_other_costs_are_written_and_go(study):
+    fixed, other = study.odometry.space.baseline, {"odometry": "gicp", "downsampling": 0.1}
+    paths = [study.folder / FILES[role] for role in (EQUAL, ANY)]
+    write_sets(study, fixed, {EQUAL: other, ANY: other})
+    for path in paths:
+        assert yaml12.Document.of_file(path).data == other
+    write_sets(study, fixed, {EQUAL: fixed})
+    assert not any(path.exists() for path in paths)

@@ -2,7 +2,8 @@ from dataclasses import replace
 
 from adaptune.paired import Ratio
 from online.statistics import ALL, ORACLE, ComparisonRow
-from online.verdict import decided, late, remarks, verdict
+from online.tables import front_table
+from online.verdict import choices, decided, late, remarks, verdict
 
 
 def rows_of(sequence=ALL, **ratios):
@@ -21,16 +22,17 @@ def every(n=12, **ratios):
     return [row for i in range(n) for row in rows_of(f"s{i}", **ratios)] + rows_of(**ratios)
 
 
-def front(fixed=7, equal=3, best=9, recommended="fixed"):
+def front(fixed=7, equal=3, best=9, recommended="fixed", left_out=""):
     """Rows of the front, as training writes them."""
     roles = {0: ["own parameters"]}
     for what, trial in (
-        ("no more CPU time", equal),
         ("within the budget", fixed),
+        ("no more CPU time", equal),
         ("any CPU time", best),
+        ("just below the budget", 5),
     ):
         roles.setdefault(trial, []).append(what)
-    return [
+    rows = [
         {
             "what": ", ".join(what),
             "trial": trial,
@@ -39,52 +41,109 @@ def front(fixed=7, equal=3, best=9, recommended="fixed"):
             "cost [ms]": 5.0 + trial,
             "low": 0.3,
             "high": 0.8,
+            "odometry": "",
+            "file": "fixed.yaml" if trial == fixed else f"{trial}.yaml",
+            "parameters": f"trial {trial}",
+            "left out": left_out if trial == fixed and recommended == "fixed" else "",
         }
         for trial, what in roles.items()
-    ] + [{"what": "adaptive", "trial": None, "recommended": recommended == "adaptive"}]
-
-
-def test_what_to_drive_what_it_gives_and_what_time_buys():
-    assert verdict(every(adaptive=0.8), 10.0, "fixed", front()) == [
-        "Drive the fixed set (trial 7): 1.000 % at 5.0 ms a scan instead of 2.000 % at 5.0 ms a "
-        "scan with the odometry's own parameters, RTE over 10 m, on 12 test sequences: 0.50 times "
-        "its error (95 % interval 0.48 to 0.52); on another drive, 0.30 to 0.80 times.",
-        "At no more CPU time: trial 3, 0.850 % at 8.0 ms in training, on another drive 0.30 to "
-        "0.80 times the error of the odometry's own parameters.",
-        "At any CPU time: trial 9, 0.550 % at 14.0 ms in training, on another drive 0.30 to 0.80 "
-        "times the error of the odometry's own parameters.",
-        "With cores to spare: adaptive, 0.800 % at 5.0 ms a scan: 0.80 times the fixed set's error "
-        "(95 % interval 0.78 to 0.82).",
     ]
-    # One set may be the best at several costs.
-    assert len(verdict(every(), 10.0, "fixed", front(7, 7, 7))) == 1
+    bank = {"what": "adaptive", "trial": None, "recommended": recommended == "adaptive"}
+    return [*rows, rows[0] | bank | {"file": "model.safetensors", "low": 0.2, "high": 0.7}]
+
+
+def said_of(rows, recommended="fixed", of_training=None, obstacle=""):
+    """The verdict with the front that belongs to it."""
+    best = decided(rows, recommended)
+    of_training = front(recommended=recommended) if of_training is None else of_training
+    found = choices(rows, of_training, best.mode, obstacle)
+    return verdict(rows, 10.0, recommended, found, obstacle)
+
+
+def test_what_to_drive_and_what_adapting_adds():
+    assert said_of(every(adaptive=0.8)) == [
+        "Drive the fixed set (trial 7): 1.000 % instead of 2.000 % with the odometry's own "
+        "parameters, for 5.0 instead of 5.0 ms a scan (RTE over 10 m, on 12 test sequences): 0.50 "
+        "times the error (95 % interval 0.48 to 0.52); on another drive, 0.30 to 0.80 times.",
+        "With cores to spare: adaptive, 0.80 times the fixed set's error (95 % interval 0.78 to "
+        "0.82), for 1.0 times the CPU time.",
+    ]
+
+
+def test_what_may_be_driven_by_cost():
+    rows = [
+        replace(row, cpu_ms=40.0) if row.mode == "adaptive" else row for row in every(adaptive=0.8)
+    ]
+    rows = [replace(row, cpu_ms=12.5) if row.mode == "fixed" else row for row in rows]
+    found = choices(rows, front(), "fixed")
+    keys = ("what", "trial", "error [%]", "cost [ms]", "driven on", "recommended", "file")
+    assert [tuple(row[key] for key in keys) for row in found] == [
+        ("own parameters", 0, 2.0, 5.0, "test", False, "0.yaml"),
+        ("no more CPU time", 3, 0.85, 8.0, "training", False, "3.yaml"),
+        ("within the budget", 7, 1.0, 12.5, "test", True, "fixed.yaml"),
+        ("any CPU time", 9, 0.55, 14.0, "training", False, "9.yaml"),
+        ("adaptive", None, 0.8, 40.0, "test", False, "model.safetensors"),
+    ]
+    # One set may be the best at several costs, and no bank may be possible.
+    assert len(choices(every(), front(7, 7, 7), "fixed", "why")) == 2
+    # Without a front, what was driven is there.
+    alone = choices(rows, [], "fixed")
+    assert [row["mode"] for row in alone] == ["baseline", "fixed", "adaptive"]
+    assert [row["recommended"] for row in alone] == [False, True, False]
+    assert not any(row["recommended"] for row in choices(rows, front(), "none"))
+    table = front_table(found, "title", " How.")
+    assert [row["choice"] for row in table.rows] == [
+        "own parameters",
+        "no more CPU time: trial 3*",
+        "-> within the budget: trial 7",
+        "any CPU time: trial 9*",
+        "adaptive",
+    ]
+    assert [row["to drive it"] for row in table.rows] == [
+        "change nothing",
+        "load 3.yaml",
+        "load fixed.yaml",
+        "load 9.yaml",
+        "run model.safetensors",
+    ]
+    assert table.rows[1]["another drive"] == "0.30-0.80"
+    assert table.caption.endswith(
+        "* Error and cost are of training: it was not driven on the test. How."
+    )
+    assert "*" not in front_table(alone, "title", "").caption
 
 
 def test_adapting_is_advised_where_training_recommends_it():
-    rows = [{**row, "low": 0.2, "high": 0.7} for row in front(recommended="adaptive")]
-    said = verdict(every(adaptive=0.8), 10.0, "adaptive", rows)
-    assert said[0].startswith("Drive adaptive: 0.800 % at 5.0 ms a scan instead of 2.000 %")
+    said = said_of(every(adaptive=0.8), "adaptive")
+    assert said[0].startswith("Drive adaptive: 0.800 % instead of 2.000 %")
     assert said[0].endswith("; on another drive, 0.20 to 0.70 times.")
-    assert not any("cores to spare" in sentence for sentence in said)
+    assert said[1].startswith("Adapting: 0.80 times the fixed set's error")
     best = decided(every(adaptive=0.8), "adaptive")
     assert best is not None
     assert best.mode == "adaptive"
 
 
 def test_own_parameters_are_kept_where_training_found_nothing_better():
-    said = verdict(every(baseline=1.0, adaptive=0.9), 10.0, "fixed", front(fixed=0, equal=0))
-    assert said[0] == (
-        "Keep the odometry's own parameters: 1.000 % at 5.0 ms a scan, RTE over 10 m, on 12 test "
-        "sequences."
-    )
-    assert said[1] == "In training, no set within the budget was safely better."
-    assert said[2].startswith("At any CPU time: trial 9, ")
-    assert said[3].startswith("With cores to spare: adaptive")
+    said = said_of(every(baseline=1.0, adaptive=0.9), of_training=front(fixed=0, equal=0))
+    assert said == [
+        "Keep the odometry's own parameters: 1.000 % at 5.0 ms a scan (RTE over 10 m, on 12 test "
+        "sequences).",
+        "In training, no set within the budget was safely better.",
+        "With cores to spare: adaptive, 0.90 times their error (95 % interval 0.87 to 0.93), for "
+        "1.0 times the CPU time.",
+    ]
+
+
+def test_what_is_better_and_cheaper_and_was_left_out_is_told():
+    rows, why = every(), "Left out: trial 4."
+    assert said_of(rows, of_training=front(left_out=why))[-1] == why
+    # Where the test contradicts training, something else is advised.
+    assert why not in said_of(every(baseline=0.8), of_training=front(left_out=why))
 
 
 def test_the_test_may_contradict_training():
-    said = verdict(every(baseline=0.8), 10.0, "fixed", front())
-    assert said[0].startswith("Keep the odometry's own parameters: 0.800 % at 5.0 ms a scan, RTE")
+    said = said_of(every(baseline=0.8))
+    assert said[0].startswith("Keep the odometry's own parameters: 0.800 % at 5.0 ms a scan (RTE")
     assert said[1] == (
         "The fixed set, which training recommends, is surely worse here: 1.25 times its error (95 "
         "% interval 1.21 to 1.29)."
@@ -92,22 +151,22 @@ def test_the_test_may_contradict_training():
     # What may be chance contradicts nothing.
     doubt = {"baseline": Ratio(1.25, (0.9, 1.7))}
     rows = [replace(r, against=doubt) if r.mode == "fixed" else r for r in every(baseline=0.8)]
-    assert verdict(rows, 10.0, "fixed", front())[0].startswith("Drive the fixed set (trial 7)")
+    assert said_of(rows)[0].startswith("Drive the fixed set (trial 7)")
     short = {"baseline": Ratio(1.25)}
     rows = [replace(r, against=short) if r.mode == "fixed" else r for r in every(baseline=0.8)]
-    first = verdict(rows, 10.0, "fixed", front())[0]
-    assert "1.25 times its error (the test is too short to tell how sure that is)" in first
+    first = said_of(rows)[0]
+    assert "1.25 times the error (the test is too short to tell how sure that is)" in first
 
 
 def test_a_rule_of_the_user_s_is_named():
     of_rule = "`mine:Rule` had 0.95 times the fixed set's error (95 % interval 0.92 to 0.98), for "
     rows = every(adaptive=0.8, **{"mine:Rule": 0.95})
-    assert verdict(rows, 10.0, "fixed", front())[-1].startswith(of_rule)
+    assert said_of(rows)[-1].startswith(of_rule)
 
 
 def test_why_nothing_adapts_is_told():
     why = "a program that runs whole recordings cannot change its parameters"
-    said = verdict(every(), 5.0, "fixed", front(7, 7, 7), why)
+    said = said_of(every(), of_training=front(7, 7, 7), obstacle=why)
     assert said[1:] == [f"Nothing adapts: {why}."]
     estimated = [replace(row, reference="estimated") for row in every()]
     assert ", on 12 test sequences by an estimated reference" in verdict(estimated, 5.0)[0]
@@ -141,15 +200,15 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
         if row.mode != "fixed"
     ]
     first = verdict(rows, 10.0)[0]
-    assert first.startswith("Drive the untrained bank: 0.800 % at 5.0 ms a scan instead of 1.000 %")
-    assert first.endswith(": 0.80 times its error (95 % interval 0.78 to 0.82).")
+    assert first.startswith("Drive the untrained bank: 0.800 % instead of 1.000 %")
+    assert first.endswith(": 0.80 times the error (95 % interval 0.78 to 0.82).")
     best = decided(rows)
     assert best is not None
     assert best.mode == "untrained"
     alone = [row for row in rows if row.mode == "baseline"]
     assert verdict(alone, 10.0) == [
-        "Keep the odometry's own parameters: 1.000 % at 5.0 ms a scan, RTE over 10 m, on 12 test "
-        "sequences."
+        "Keep the odometry's own parameters: 1.000 % at 5.0 ms a scan (RTE over 10 m, on 12 test "
+        "sequences)."
     ]
     near = [replace(row, ratio_interval=(1.004, 1.12)) for row in every(adaptive=1.04)]
     assert "(95 % interval 1.004 to 1.12)" in verdict(near, 10.0)[-1]

@@ -47,8 +47,10 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     done = gate("bad", "good", "--out", "out")
     assert done.exit_code == 3, done.output
     assert "WORSE: bad.yaml against good.yaml, 3 recordings: error x" in done.stdout
-    data = json.loads((bags / "out/gate.json").read_text())
-    assert data["verdict"] == "worse"
+    data = json.loads((bags / "out/verdict.json").read_text())
+    assert data["verdict"] == data["action"] == "worse"
+    assert (data["odometry"], data["mode"]) == ("fake_odometry:Fake", "baseline")
+    assert data["ratio"] > data["interval"][0] > 1.0
     errors = [row for row in data["rows"] if row["quantity"] == "error"]
     assert [row["recording"] for row in errors] == ["drive_a", "drive_b", "drive_c", "all"]
     assert all(row["ratio"] > 1.05 for row in errors)
@@ -59,7 +61,9 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     # Another file of the same values is driven anew, and equal bit by bit.
     done = gate("same", "good", "--out", "out")
     assert done.exit_code == 0, done.output
-    rows = json.loads((bags / "out/gate.json").read_text())["rows"]
+    data = json.loads((bags / "out/verdict.json").read_text())
+    assert data["action"] == "pass"
+    rows = data["rows"]
     assert {row["ratio"] for row in rows if row["quantity"] == "error"} == {1.0}
 
 
@@ -112,7 +116,7 @@ def test_for_the_cost_both_are_driven_twice_by_turns_and_that_is_kept(bags, monk
 
     monkeypatch.setattr("online.turns.Tracker.register", register)
     gate("same", "good", "--out", "out", "--cost", "1000000", recordings=("drive_a.bag",))
-    data = json.loads((bags / "out/gate.json").read_text())
+    data = json.loads((bags / "out/verdict.json").read_text())
     (row,) = [row for row in data["rows"] if row["quantity"] == "cost"]
     assert row["new"] > 0.0
     assert row["low"] < row["ratio"] < row["high"]
@@ -136,7 +140,7 @@ def test_what_has_changed_since_has_no_cost():
     study = bad / "study.yaml"
     study.write_text(re.sub("downsampling: .*", "downsampling: 0.7", study.read_text()))
     commands.call("compare", bad, "--against", good, "--out", "out")
-    rows = json.loads(Path("out/gate.json").read_text())["rows"]
+    rows = json.loads(Path("out/verdict.json").read_text())["rows"]
     assert {row["verdict"] for row in rows if row["quantity"] == "cost"} == {"unclear"}
     (why,) = {row["why"] for row in rows if row["quantity"] == "cost" and row["recording"] != "all"}
     assert "has changed since: odometry.settings.downsampling" in why

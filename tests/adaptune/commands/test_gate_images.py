@@ -40,7 +40,7 @@ def test_an_image_with_a_slip_is_worse(images, tmp_path, monkeypatch):
         drives.write_bag(Path(bag), drives.scans(seed, 150))
     done = commands.call("compare", new, *bags, "--against", old, "--out", "out")
     assert done.exit_code == 3, done.output
-    rows = json.loads(Path("out/gate.json").read_text())["rows"]
+    rows = json.loads(Path("out/verdict.json").read_text())["rows"]
     errors = {row["recording"]: row["ratio"] for row in rows if row["quantity"] == "error"}
     assert all(ratio > 2.0 for ratio in errors.values())
     # A whole run has one figure of its cost, which differs each time.

@@ -10,13 +10,11 @@ import drives
 import pytest
 import rec
 
-from adaptune.commands.tune import say_odometries
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.tuning import asked, tuned
 from adaptune.yaml12 import Document
 from offline.config import load_study
-from offline.train import COST
 
 FAKE = ("--odometry", "fake_odometry:Fake")
 
@@ -61,8 +59,11 @@ def test_one_command_tunes_compares_and_resumes(bag, tmp_path):
     lines = done.stdout.splitlines()
     begin = next(i for i, line in enumerate(lines) if line.startswith(("Drive", "Keep")))
     assert (folder / "report/report.html").exists()
-    assert f"The parameters: runs/{folder.name}/fixed.yaml." in lines[begin + 1]
-    assert lines[begin + 2].startswith("More: runs/")
+    assert lines[begin + 1].startswith("What each choice gives over ")
+    assert f"Files: runs/{folder.name}" in " ".join(lines)
+    assert (folder / "verdict.json").exists()
+    (more,) = (line for line in lines if line.startswith("More: "))
+    assert more.startswith("More: runs/")
     # The same command does nothing again; a greater budget continues.
     model = (folder / "model.safetensors").stat().st_mtime_ns
     commands.call("tune", bag, *FAKE, "--trials", 4)
@@ -173,22 +174,6 @@ def test_a_folder_that_grows_changes_only_the_lists_of_its_study(study_file):
     study = study_in(path)
     assert (study.training, study.config.test) == (["one", "three"], ("two",))
     assert study.config.offline.stretches == 24
-
-
-def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):
-    said = []
-    monkeypatch.setattr("adaptune.commands.tune.say", said.append)
-    monkeypatch.setattr("adaptune.commands.tune.show_table", lambda *_: None)
-    study = SimpleNamespace(config=SimpleNamespace(odometries={"gicp": 0, "ndt": 0}))
-    trials = [
-        {"odometry": name, "mean": mean, COST: 1.0} for name, mean in (("gicp", 2), ("ndt", 1))
-    ]
-    model = SimpleNamespace(fixed=7, sets={7: {"odometry": "gicp"}})
-    say_odometries(study, SimpleNamespace(trials=trials, model=model))
-    assert said == [
-        "Best odometry in training: ndt. On the test, the fixed set is gicp's, the baseline "
-        "gicp's; to see another there, name it alone (--odometry)."
-    ]
 
 
 @pytest.mark.usefixtures("decided")

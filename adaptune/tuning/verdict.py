@@ -1,0 +1,66 @@
+"""The verdict of a study: the table of what may be driven, and a file for programs."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+from adaptune.archive import Archive
+from adaptune.files import write_text
+from adaptune.manifest import plain
+from adaptune.report.tables import Listing
+from offline.choice import USUAL_BUDGET
+from offline.config import OfflineStudy
+from offline.front import COST, OWN
+from online import tables
+from online.compare import ComparedReplays
+from online.modes import BASELINE
+
+FILE = "verdict.json"
+
+
+def front_table(study: OfflineStudy, found: ComparedReplays) -> Listing:
+    """What may be driven, and how."""
+    metres, folder = f"{study.config.sub_trajectory:g} m", study.folder
+    how = f" RTE: mean error of the parts of the path that are {metres} long. Files: {folder}"
+    own = None if study.fixed is None else study.own_file(study.fixed)
+    if own is not None and own[0].exists():
+        how += f"; fixed.yaml for the odometry's own tool: {own[0].name} ({own[1].use})"
+    if any(row["mode"] == "adaptive" for row in found.front):
+        how += f". Adaptive, on a robot: `adaptune online {folder} --ros2 --mode adaptive`"
+    return tables.front_table(found.front, f"What each choice gives over {metres}", f"{how}.")
+
+
+def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:
+    """Write ``verdict.json`` into the study's folder: what to do, what that gives, and why."""
+    config, model = study.config, found.model
+    row = next((row for row in found.front if row["recommended"]), dict[str, Any]())
+    mode, trial = row.get("mode"), row.get("trial")
+    last = next((one for one in found.rows[::-1] if one.mode == mode), None)
+    ratio = None if last is None else last.against.get(BASELINE)
+    action = "keep" if row.get("what") == OWN else "drive" if row else found.advised or "unknown"
+    ms = None if model is None else model.milliseconds
+    own = next((one["trial"] for one in found.front if one["what"] == OWN), None)
+    if model is not None and model.costs is not None and own is not None and ms is None:
+        cost = USUAL_BUDGET * model.costs.alone(own)
+        ms = cost if np.isfinite(cost) else None
+    data = {
+        "action": action,
+        "odometry": row.get("odometry") or next(iter(config.odometries)),
+        "mode": mode,
+        "set": trial,
+        "parameters": None if model is None or trial is None else model.sets[trial],
+        "file": row.get("file") or None,
+        "error_percent": row.get("error [%]"),
+        "cost_ms": row.get(COST),
+        "ratio": ratio and ratio.value,
+        "interval": ratio and ratio.interval,
+        "on_another_drive": [row["low"], row["high"]] if row else None,
+        "sets_tried": len(Archive(study.folder / "trials").sets()),
+        "sets_asked": config.offline.most_trials,
+        "budget": config.online.budget or f"{USUAL_BUDGET:g}x",
+        "budget_ms": ms,
+        "why": found.verdict,
+        "front": found.front,
+    }
+    write_text(study.folder / FILE, json.dumps(plain(data), indent=1) + "\n")
