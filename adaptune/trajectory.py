@@ -114,7 +114,8 @@ class Trajectory:
             since, step = (int(at - self.stamps[near]) for at in (stamp, self.stamps[other]))
             if abs(since) <= _BESIDE * abs(step) and abs(step) <= gap:
                 T_near = self.T_world_sensor[near]
-                return T_near @ scale(invert(T_near) @ self.T_world_sensor[other], since / step)
+                T_near_other = invert(T_near) @ self.T_world_sensor[other]
+                return np.asarray(T_near @ scale(T_near_other, since / step))
         return np.full((4, 4), np.nan)
 
 
