@@ -329,7 +329,8 @@ def compare(study: Study) -> ComparedReplays:
         advised = NONE if said else advised
     front = choices(rows, _front(study, model), advised, obstacle)
     if advised != NONE:
-        said += verdict(rows, length, recommended, front, obstacle)
+        tried = 0 if model is None else len(model.sets)
+        said += verdict(rows, length, recommended, front, obstacle, tried)
         said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]

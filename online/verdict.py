@@ -124,12 +124,13 @@ def verdict(
     recommended: str = FIXED,
     front: Sequence[Mapping[str, Any]] = (),
     obstacle: str = "",
+    tried: int = 0,
 ) -> list[str]:
     """What to do, and why, in at most five sentences.
 
     Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres.
-    Training recommends a mode; the `front` is that of `choices`; `obstacle` says why nothing
-    adapts.
+    Training `tried` so many sets, and recommends a mode; the `front` is that of `choices`;
+    `obstacle` says why nothing adapts.
     """
     last = _judged(rows)
     if (best := decided(rows, recommended)) is None:
@@ -147,7 +148,7 @@ def verdict(
     where = f"(RTE over {length:g} m, {_where(rows)}{judge})"
     if best is base:
         said = [f"Keep {CALLED[BASELINE]}: {_error_and_cost(best)} {where}."]
-        said += _why_kept(best, last, recommended)
+        said += _why_kept(best, last, recommended, tried)
     else:
         what = called(best.mode) + (f" (trial {trial})" if best.mode == FIXED and trial else "")
         said = [f"Drive {what}: {_gained(best, base, where, own)}."]
@@ -183,12 +184,13 @@ def _gained(
 
 
 def _why_kept(
-    best: ComparisonRow, last: Mapping[str, ComparisonRow], recommended: str
+    best: ComparisonRow, last: Mapping[str, ComparisonRow], recommended: str, tried: int
 ) -> list[str]:
     """Why the odometry's own parameters are kept."""
     other = last.get(recommended)
     if other is None or other is best or _is_baseline(other):
-        return ["In training, no set within the budget was safely better."] * (FIXED in last)
+        none = f"none of {tried - 1} other sets" if tried > 2 else "no other set"
+        return [f"In training, {none} was safely better within the budget."] * (FIXED in last)
     ratio = _to_baseline(other)
     return [
         f"{called(recommended).capitalize()}, which training recommends, is surely worse here: "
