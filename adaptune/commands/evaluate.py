@@ -5,16 +5,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from adaptune.commands.online import WORSE, Details, Unclear, share_of
+from adaptune.commands.online import WORSE, Details, share_of
 from adaptune.commands.terminal import As, Given, Points, progress, say, show_table
-from adaptune.errors import AdaptuneError
 
 Words = Annotated[
     list[str],
     typer.Argument(
         metavar="BAG... TRAJECTORY...",
-        help="A bag, or several; files of poses, topics, topics of other bags (run2.bag:/odom), "
-        "chains of transforms (/tf:map.base_link).",
+        help="Bags; and files of poses, topics, topics of other bags (run2.bag:/odom), or chains "
+        "of transforms (/tf:map.base_link).",
         show_default=False,
     ),
 ]
@@ -32,9 +31,7 @@ Moment = Annotated[
 ]
 Length = Annotated[
     float | None,
-    typer.Option(
-        metavar="METRES", help="What errors are measured over.", show_default="as the path allows"
-    ),
+    typer.Option(help="Metres that errors are measured over.", show_default="as the path allows"),
 ]
 Out = Annotated[Path, typer.Option(help="Folder of the page and the tables.", file_okay=False)]
 
@@ -48,7 +45,6 @@ def evaluate(
     pose_time: Moment = "stamp",
     sub_trajectory: Length = None,
     most: Most = None,
-    unclear: Unclear = "pass",
     reading: As = None,
     out: Out = Path("runs/evaluate"),
     details: Details = False,
@@ -61,12 +57,11 @@ def evaluate(
     """
     from adaptune.evaluation import evaluated
     from adaptune.evaluation.given import parted
-    from adaptune.evaluation.page import tables
-    from adaptune.evaluation.words import ALIKE
+    from adaptune.evaluation.shown import tables
 
     limit = None if most is None else 100.0 * share_of(most, "max")
     bags, trajectories = parted(words)
-    place = None if extrinsic is None else _numbers(extrinsic)
+    place = None if extrinsic is None else extrinsic.strip("[] ").replace(",", " ").split()
     with progress() as show:
         found = evaluated.evaluate(
             bags,
@@ -82,22 +77,11 @@ def evaluate(
             progress=show,
         )
     verdict = "below" if limit is None else found.verdict(limit)
-    if limit is not None:
-        said = {"above": "Surely above", "below": "Below", "unclear": "TOO LITTLE TO TELL, at"}
-        say(f"{said[verdict]} {limit:g} %.")
-    for sentence in found.words:
+    said = {"above": "Surely above", "below": "Below", "unclear": "TOO LITTLE TO TELL, at"}
+    first = [] if limit is None else [f"{said[verdict]} {limit:g} %."]
+    for sentence in (*first, *found.words, f"More: {found.page}, and .json, .csv beside it"):
         say(sentence)
-    say(f"More: {found.page}; {out}/evaluation.json, evaluation.csv")
-    if details and any(one.judge.reference.estimated for one in found.judged):
-        say(ALIKE)
     for listing in tables(found.judged, found.pairs)[: None if details else 1]:
         show_table(*listing)
-    if verdict == "above" or (verdict == "unclear" and unclear == "fail"):
+    if verdict == "above":
         raise typer.Exit(WORSE)
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(number) for number in text.strip(" []").replace(",", " ").split()]
-    except ValueError as error:
-        raise AdaptuneError(f"--extrinsic {text}: give x y z qx qy qz qw") from error

@@ -1,70 +1,77 @@
-"""A trajectory as a reference judges it: how wrong it is, where, and how it compares."""
+"""A trajectory as a reference judges it: how wrong it is, where, and how surely."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.errors import Finding
+from adaptune.errors import AdaptuneError, Finding
 from adaptune.geometry import Poses
-from adaptune.metrics import span, travelled
-from adaptune.paired import ERROR_FACTOR, Interval, Pair, Ratio, interval_of_mean, ratio
+from adaptune.metrics import LOST_ABOVE, span, travelled
+from adaptune.paired import ERROR_FACTOR, Interval, Pair, interval_of_mean
+from adaptune.recording.poses import sound
 from adaptune.reference.carried import stands
 from adaptune.reference.check import FEWEST, LONGER
-from adaptune.reference.judge import Reference, columns_of
+from adaptune.reference.judge import Reference
 from adaptune.trajectory import Trajectory
 
-_GIVES_NOTHING = 3.5
-"""How many times its usual step a trajectory pauses, and a second at least, to give nothing."""
-Verdict = Literal["above", "below", "unclear"]
+_PAUSE = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
 
 
 class Judge(NamedTuple):
     """What judges the trajectories of a recording."""
 
     recording: str
-    reference: Reference
+    reference: Reference  # it has poses
     name: str  # in words
-    scans: tuple[int, int]  # nanoseconds of the first one, and about those of the last
+    begin: int  # nanoseconds of the first scan, and about those of the last
+    end: int
     unknown: Sequence[tuple[float, float, str]] = ()  # from when to when, in seconds, and why
+    doubt: str = ""  # what the scans say against it
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses of the reference."""
+        """Its poses."""
         assert self.reference.trajectory is not None
         return self.reference.trajectory
 
+    def stamps(self, *others: Trajectory) -> NDArray[np.int64]:
+        """Where trajectories are judged: at the poses of the one that has the fewest, (n,).
 
-def common_stamps(judge: Trajectory, *others: Trajectory) -> NDArray[np.int64]:
-    """Where trajectories are compared: at the poses of the one that has the fewest, of shape (n,).
+        All others go straight between theirs. In each gap of the judge lies one more, where nothing
+        is known: no sub-trajectory crosses it.
+        """
+        mine = self.trajectory.stamps
+        begin, end = (side([mine, *(o.stamps for o in others)]) for side in (_latest, _earliest))
+        every = [s[(s >= begin) & (s <= end)] for s in (mine, *(o.stamps for o in others))]
+        gaps = np.flatnonzero(np.diff(mine) > self.trajectory.max_gap * 1e9)
+        middle = (mine[gaps] // 2 + mine[gaps + 1] // 2)[: len(every[0])]
+        stamps = np.union1d(min(every, key=len), middle[(middle > begin) & (middle < end)])
+        known = [np.isfinite(other.at(stamps)[:, 0, 0]) for other in others]
+        return np.asarray(stamps[np.all(known, axis=0) | np.isin(stamps, middle)])
 
-    All others go straight between theirs. In each gap of the judge lies one more, where nothing is
-    known: no sub-trajectory crosses it.
-    """
-    every = [judge.stamps, *(other.stamps for other in others)]
-    begin, end = max(s[0] for s in every), min(s[-1] for s in every)
-    fewest = min((s[(s >= begin) & (s <= end)] for s in every), key=len)
-    gaps = np.flatnonzero(np.diff(judge.stamps) > judge.max_gap * 1e9)
-    middle = judge.stamps[gaps] + np.diff(judge.stamps)[gaps] // 2
-    stamps = np.union1d(fewest, middle[(middle >= begin) & (middle <= end)])
-    in_gaps = np.isnan(judge.at(stamps)[:, 0, 0])
-    known = [np.isfinite(other.at(stamps)[:, 0, 0]) for other in others]
-    return stamps[np.all(known, axis=0) | in_gaps]
+
+def _latest(stamps: Sequence[NDArray[np.int64]]) -> int:
+    return max(int(one[0]) for one in stamps)
+
+
+def _earliest(stamps: Sequence[NDArray[np.int64]]) -> int:
+    return min(int(one[-1]) for one in stamps)
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A trajectory, judged."""
+    """A trajectory of the LiDAR's poses, judged at stamps of shape (n,)."""
 
     name: str
-    trajectory: Trajectory  # of the LiDAR's poses
     judge: Judge
-    stamps: NDArray[np.int64]  # (n,): where it is judged
-    causes: Sequence[Finding] = ()  # what its poses are, and what is wrong with them
+    trajectory: Trajectory
+    stamps: NDArray[np.int64]
+    cause: Finding | None = None  # what its poses are, if not the LiDAR's at the stamps
 
     @property
     def title(self) -> str:
@@ -73,14 +80,18 @@ class Judged:
 
     @cached_property
     def odometry(self) -> Trajectory:
-        """Its poses where it is judged."""
-        known = np.nan_to_num(self.trajectory.at(self.stamps, 1e9))
-        return Trajectory(self.stamps, known)
+        """Its poses at the stamps."""
+        return Trajectory(self.stamps, np.nan_to_num(self.trajectory.at(self.stamps, 1e9)))
 
     @cached_property
     def truth(self) -> Poses:
         """The judge's poses there, of shape (n, 4, 4); NaN where they are unknown."""
         return self.judge.trajectory.at(self.stamps)
+
+    @cached_property
+    def seconds(self) -> NDArray[np.float64]:
+        """From the first scan on, of shape (n,)."""
+        return np.asarray((self.stamps - self.judge.begin) * 1e-9)
 
     @cached_property
     def errors(self) -> NDArray[np.float64]:
@@ -92,149 +103,98 @@ class Judged:
         """Mean RTE in percent of the sub-trajectories through each pose, of shape (n,), or NaN."""
         return self.judge.reference.errors_around(self.odometry)
 
-    @property
-    def seconds(self) -> NDArray[np.float64]:
-        """Since the first scan, of shape (n,)."""
-        return (self.stamps - self.judge.scans[0]) * 1e-9
-
-    @property
-    def known(self) -> NDArray[np.float64]:
-        """The errors that are known."""
-        return self.errors[np.isfinite(self.errors)]
-
-    @property
-    def rte(self) -> float | None:
-        """Mean error in percent; None if no sub-trajectory fits into what is known."""
-        return float(self.known.mean()) if len(self.known) else None
-
-    @property
-    def block(self) -> int:
-        """Frames of a sub-trajectory."""
-        return span(self.truth, self.judge.reference.length)
+    @cached_property
+    def rte(self) -> float:
+        """Mean error in percent."""
+        if np.isfinite(self.errors).any():
+            return float(np.nanmean(self.errors))
+        metres = self.judge.reference.length
+        what = f"no {metres:g} m of it can be judged; name a longer one, or a smaller length"
+        raise AdaptuneError(f"{self.title}: {what} (sub_trajectory)")
 
     @cached_property
     def interval(self) -> Interval:
-        """Of the mean error, 95 %, with the judge's own error, where that is known."""
-        own = self.judge.reference.error
-        return interval_of_mean(self.known, self.block, own) if len(self.known) else None
+        """95 % interval of the mean error, with the judge's own error as far as it is known."""
+        known = self.errors[np.isfinite(self.errors)]
+        block = span(self.truth, self.judge.reference.length)
+        return interval_of_mean(known, block, self.judge.reference.error)
 
     @property
     def blind(self) -> bool:
         """Whether the judge is about as wrong as what it judges."""
-        own = self.judge.reference.error or 0.0
         low = self.interval[0] if self.interval else math.inf
-        return self.rte is not None and (low == 0.0 or self.rte < ERROR_FACTOR * own)
+        return low == 0.0 or self.rte < ERROR_FACTOR * (self.judge.reference.error or 0.0)
 
     @cached_property
-    def drift(self) -> tuple[float, float] | None:
+    def drift(self) -> tuple[float, float]:
         """Metres of error in a hundred, and over how many metres that was measured."""
-        metres = float(travelled(self.truth)[-1])
-        length = self.judge.reference.length
-        fit = [m for m in LONGER if m > length and FEWEST * m <= metres]
-        for longer in sorted({length, *fit}, reverse=True):
-            errors = self.judge.reference._replace(length=longer).errors(self.odometry)
-            if len(known := errors[np.isfinite(errors)]):
-                return float(known.mean()), longer
-        return None
-
-    @property
-    def worst(self) -> int | None:
-        """Which pose the sub-trajectories with the greatest error go through."""
-        return int(np.nanargmax(self.around)) if np.isfinite(self.around).any() else None
+        reference, metres = self.judge.reference, float(travelled(self.truth)[-1])
+        for length in (m for m in LONGER[::-1] if FEWEST * m <= metres and m > reference.length):
+            errors = reference._replace(length=length).errors(self.odometry)
+            if np.isfinite(errors).any():
+                return float(np.nanmean(errors)), length
+        return self.rte, reference.length
 
     @cached_property
     def unknown_share(self) -> float:
-        """Share of the scans' time that it covers in which the judge knows no pose."""
-        begin, end = max(self.stamps[0], self.judge.scans[0]), self.stamps[-1]
-        stamps = np.linspace(begin, end, 2000).astype(np.int64)
-        gap = max(self.judge.trajectory.max_gap, 0.0)
-        return float(np.isnan(self.judge.trajectory.at(stamps, gap)[:, 0, 0]).mean())
+        """Share of its time in which the judge knows no pose."""
+        begin, end = max(int(self.trajectory.stamps[0]), self.judge.begin), int(self.stamps[-1])
+        judge = self.judge.trajectory
+        steps = np.diff([begin, *judge.stamps[(judge.stamps > begin) & (judge.stamps < end)], end])
+        return float(steps[steps > judge.max_gap * 1e9].sum() / max(end - begin, 1))
 
     @cached_property
     def faults(self) -> list[Finding]:
-        """Where it stood still while the robot moved, or gave nothing."""
-        T, step = self.odometry.T_world_sensor, np.diff(self.trajectory.stamps) * 1e-9
-        still = [
-            Finding((), "stands still while the robot moves", seconds=(begin, end))
-            for begin, end in _spans(stands(self.truth, T), self.seconds)
-        ]
-        long = np.flatnonzero(step > max(1.0, _GIVES_NOTHING * float(np.median(step))))
-        ends = (self.trajectory.stamps - self.judge.scans[0]) * 1e-9
-        nothing = [
-            Finding((), "gives nothing", seconds=(float(ends[i]), float(ends[i + 1])))
-            for i in long.tolist()
-        ]
-        return still + nothing
-
-    @property
-    def covered(self) -> str:
-        """Where it covers only a part of the scans, in words."""
-        begin, end = ((s - self.judge.scans[0]) * 1e-9 for s in self.trajectory.stamps[[0, -1]])
-        seconds = (self.judge.scans[1] - self.judge.scans[0]) * 1e-9
-        if max(begin, 0.0) + max(seconds - end, 0.0) <= max(1.0, 0.05 * seconds):
-            return ""
-        return f"covers {max(begin, 0.0):.1f} to {min(end, seconds):.1f} of {seconds:.1f} s"
-
-    def verdict(self, most: float) -> Verdict:
-        """Whether its error is surely above, or below, so many percent."""
-        if self.rte is None or self.interval is None:
-            return "unclear"
-        low, high = self.interval
-        return "above" if low > most else "below" if high <= most else "unclear"
+        """Where it jumps, stands still while the robot moves, or gives nothing."""
+        judge, stamps = self.judge, self.trajectory.stamps
+        found = [f._replace(mend="") for f in sound(self.trajectory, judge.begin, name="it")[1]]
+        if found and found[-1].seconds is None:
+            to_and_fro = found.pop()
+            if self.cause is None and self.rte > LOST_ABOVE:
+                what = f"{to_and_fro.what}; if two nodes publish it by turns, record one of them"
+                raise AdaptuneError(f"{self.title}: {what}")
+        still = stands(self.truth, self.odometry.T_world_sensor)
+        edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
+        what = "it stands still while the robot moves"
+        spans = [(what, *self.seconds[edge - (0, 1)]) for edge in edges]
+        ends = (np.array([min(judge.begin, stamps[0]), *stamps, judge.end]) - judge.begin) * 1e-9
+        usual = max(1.0, _PAUSE * float(np.median(np.diff(ends))))
+        long = np.flatnonzero(np.diff(ends) > usual)
+        spans += [("it gives nothing", *ends[i : i + 2]) for i in long]
+        return found + [Finding((), what, seconds=(float(a), float(b))) for what, a, b in spans]
 
     @property
     def row(self) -> dict[str, Any]:
-        """The row of a table."""
-        low, high = self.interval or (None, None)
-        drift, worst = self.drift, self.worst
-        x, y, z = (None,) * 3 if worst is None else self.truth[worst, :3, 3].tolist()
+        """The row of a table; columns that begin with an underscore are for files only."""
+        (low, high), reference = self.interval or (None, None), self.judge.reference
+        worst, (drift, over) = int(np.nanargmax(self.around)), self.drift
         return {
             "recording": self.judge.recording,
             "trajectory": self.name,
             "RTE [%]": self.rte,
             "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
-            "drift [m/100 m]": drift and drift[0],
-            "worst [%]": None if worst is None else float(self.around[worst]),
-            "at [s]": None if worst is None else float(self.seconds[worst]),
-            "faults": len(self.faults) + len(self.causes),
+            "drift [m/100 m]": drift,
+            "worst [%]": float(self.around[worst]),
+            "at [s]": float(self.seconds[worst]),
+            "x [m]": float(self.truth[worst, 0, 3]),
+            "y [m]": float(self.truth[worst, 1, 3]),
             "unknown [%]": 100.0 * self.unknown_share,
+            "faults": len(self.faults),
             "_low": low,
             "_high": high,
-            "_length_m": self.judge.reference.length,
-            "_drift_over_m": drift and drift[1],
-            "_worst_x_m": x,
-            "_worst_y_m": y,
-            "_worst_z_m": z,
+            "_length_m": reference.length,
+            "_drift_over_m": over,
             "_judge": self.judge.name,
-            "_judge_error_percent": self.judge.reference.error,
-            "_findings": "; ".join(map(str, [*self.causes, *self.faults])),
+            "_judge_error_percent": reference.error,
+            "_findings": "; ".join(map(str, [*([self.cause] if self.cause else []), *self.faults])),
         }
-
-    @property
-    def standard(self) -> dict[str, Any]:
-        """The row of a table of the errors that other tools give."""
-        head = {"recording": self.judge.recording, "trajectory": self.name}
-        return head | columns_of(self.judge.reference.standard(self.odometry))
-
-
-def _spans(which: NDArray[np.bool_], seconds: NDArray[np.float64]) -> Iterable[tuple[float, float]]:
-    """From when to when something holds, of shape (n,)."""
-    edges = np.flatnonzero(np.diff(which, prepend=False, append=False)).reshape(-1, 2)
-    return [(float(seconds[begin]), float(seconds[end - 1])) for begin, end in edges.tolist()]
 
 
 def pair_of(one: Judged, other: Judged) -> Pair:
     """Two trajectories of a recording, at stamps that both have."""
-    judge, length = one.judge, one.judge.reference.length
-    stamps = common_stamps(judge.trajectory, one.trajectory, other.trajectory)
-    both = [Judged(j.name, j.trajectory, judge, stamps) for j in (one, other)]
-    errors = np.stack([j.errors for j in both])
+    judge = one.judge
+    stamps = judge.stamps(one.trajectory, other.trajectory)
+    errors = np.stack([Judged(j.name, judge, j.trajectory, stamps).errors for j in (one, other)])
+    block = span(judge.trajectory.at(stamps), judge.reference.length)
     known = errors[:, np.isfinite(errors).all(axis=0)]
-    block = span(judge.trajectory.at(stamps), length)
     return Pair(known, block, judge.recording, judge.reference.error)
-
-
-def compared(pairs: Sequence[Pair]) -> Ratio | None:
-    """The ratio of the errors of two trajectories over recordings; None if nothing is known."""
-    known = [pair for pair in pairs if pair.errors.size]
-    return ratio(known) if known else None

@@ -100,19 +100,17 @@ def chained(moving: Sequence[Any], fixed: Sequence[Any], parent: str, child: str
     `moving` and `fixed` are transforms. A ValueError says why there is no chain.
     """
     links: dict[str, tuple[str, list[Pose]]] = {}
-    for number, transform in enumerate([*moving, *fixed]):
-        above, below = (
-            name.lstrip("/") for name in (transform.header.frame_id, transform.child_frame_id)
-        )
+    for t in (*fixed, *moving):
+        above, below = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
         if links.setdefault(below, (above, []))[0] != above:
             both = f"{links[below][0]} and {above}"
             raise ValueError(f"{below} has two parents, {both}: two nodes publish it; record one")
-        links[below][1].extend(_transforms([transform]) if number < len(moving) else [])
-        if number >= len(moving):
-            p, q = transform.transform.translation, transform.transform.rotation
-            links[below][1][:] = [(stamp, below, p, q) for stamp in (_BEGIN, _END)]
+        links[below][1].extend(_transforms([t]))
+    for t in fixed:
+        _, poses = links[t.child_frame_id.lstrip("/")]
+        poses[:] = [(stamp, *poses[-1][1:]) for stamp in (_BEGIN, _END)]
     way, frame = list[Trajectory](), child.lstrip("/")
-    while frame != parent.lstrip("/"):
+    while frame != parent.lstrip("/") or not way:
         if frame not in links or len(way) > len(links):
             known = ", ".join(sorted({*links, *(above for above, _ in links.values())}))
             raise ValueError(f"no chain leads from {parent} to {child}; there is {known}")
@@ -120,11 +118,9 @@ def chained(moving: Sequence[Any], fixed: Sequence[Any], parent: str, child: str
         if (link := usable(poses)[0]) is None:
             raise ValueError(f"{poses[0][1]} has no pose that is finite")
         way.append(link)
-    if not way:
-        raise ValueError(f"{parent}.{child} is one frame; name two")
     stamps = max((link.stamps for link in way), key=len)
-    T = np.tile(np.eye(4), (len(stamps), 1, 1))
+    T = np.eye(4)
     for link in reversed(way):
         T = T @ link.at(stamps, _FOREVER)
-    known = np.isfinite(T[:, 0, 0])
-    return Trajectory(stamps[known], T[known])
+    known_poses = np.isfinite(T[:, 0, 0])
+    return Trajectory(stamps[known_poses], T[known_poses])

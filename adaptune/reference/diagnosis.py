@@ -136,7 +136,7 @@ UNEXPLAINED = ", which none of the known causes explains"
 
 
 class Mends(NamedTuple):
-    """What mends poses, in the words of who gives them; braces stand for the value found."""
+    """What mends poses, as who gives them is told; braces stand for the value that was found."""
 
     clock: str = "add {:.3f} to `clock_offset`"
     place: str = "set `extrinsic: [{}]`, the LiDAR's pose in their frame"
@@ -149,18 +149,18 @@ class Mends(NamedTuple):
     )
 
 
-OF_STUDY = Mends()
-OF_ODOMETRY = Mends(
+_OF_STUDY = Mends()
+_OF_ODOMETRY = Mends(
     place="return the LiDAR's poses: multiply by its place in the body, {}",
     own="that is the odometry's own error, and no convention: tuning may lessen it",
 )
-OF_OPTIONS = Mends(
+_OPTIONS = Mends(
     clock="add {:.3f} to `--clock-offset`",
-    place='`--extrinsic "{}"` is the LiDAR\'s pose in their frame',
-    own="that is the trajectory's own error, and no option mends it",
+    place='give `--extrinsic "{}"`, the LiDAR\'s pose in their frame',
+    own="that is its own error, and no option mends it",
     rare="write more poses a second",
     unturned="write the orientations, too",
-    ends="`--pose-time end` takes them as poses of scans' ends",
+    ends="if they are of scans' ends, give `--pose-time end`",
 )
 
 
@@ -197,7 +197,7 @@ def diagnose_reference(
     stamps: NDArray[np.int64],
     hops: Hops,
     place: Poses | None = None,
-    mends: Mends = OF_STUDY,
+    mends: Mends = _OF_STUDY,
 ) -> Finding | None:
     """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
 
@@ -244,8 +244,8 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
             np.array([*accumulate(safe, np.matmul)]),
         ),
         *_conventions(T_odom_sensor),
-        *_scales(T_odom_sensor, hops, np.eye(4), OF_ODOMETRY),
-        *_places(T_odom_sensor, hops, OF_ODOMETRY),
+        *_scales(T_odom_sensor, hops, np.eye(4), _OF_ODOMETRY),
+        *_places(T_odom_sensor, hops, _OF_ODOMETRY),
     ]
     # What is left may be the odometry's own error.
     return _likeliest([c._replace(most=EXPLAINED) for c in candidates], hops, errors)
@@ -533,7 +533,7 @@ def _of_ends(
     stamps: NDArray[np.int64],
     span: float,
     T_odom_sensor: Poses,
-    mends: Mends = OF_STUDY,
+    mends: Mends = _OF_STUDY,
 ) -> Finding | None:
     """Whether an odometry's poses fit the reference best about one scan later than their stamps."""
     shares = (0.0, 1.0, -1.0, -0.5, 0.5, 1.5, 2.0)
@@ -548,7 +548,7 @@ def _of_ends(
     return Finding(("the odometry's poses",), what, mends.ends, of="reference")
 
 
-APART = 50.0  # percent by which most motions of another drive differ, or of a lost odometry
+_APART = 50.0  # percent by which most motions of another drive differ, or of a lost odometry
 _EVENLY = 100  # motions of a reference that say what other poses are
 
 
@@ -557,27 +557,35 @@ def diagnose_trajectory(
     judge: Trajectory,
     stamps: NDArray[np.int64],
     span: float,
-    place: Poses | None,
+    place: Poses | None = None,
 ) -> Finding | None:
-    """What the poses of a trajectory are that a trusted reference contradicts; None if it agrees.
+    """What poses are that a trusted reference contradicts; None if it does not, or nobody can tell.
 
     The stamps, of shape (n,), are where both are compared; `span` is how many nanoseconds a scan
-    takes, and `place` as in `diagnose_reference`.
+    takes, and `place` is as in `diagnose_reference`.
     """
-    T = judge.at(stamps)
-    ends = window_ends(T, _METRES)
+    T_ref_sensor, T_odom_sensor = judge.at(stamps), trajectory.at(stamps)
+    ends = window_ends(T_ref_sensor, _METRES)
     starts = np.flatnonzero(ends >= 0)
     starts = starts[:: max(1, len(starts) // _EVENLY)]
-    known = np.tile(np.eye(3), (len(starts), 1, 1))
-    hops = Hops(starts, ends[starts], invert(T[starts]) @ T[ends[starts]], known)
-    cause = diagnose_reference(trajectory, stamps, hops, place, OF_OPTIONS)
-    if cause is not None:
+    T = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends[starts]]
+    hops = Hops(starts, ends[starts], T, np.tile(np.eye(3), (len(starts), 1, 1)))
+    if (cause := diagnose_reference(trajectory, stamps, hops, place, _OPTIONS)) is not None:
         return cause._replace(what=cause.what.replace("registrations of scans", "the reference"))
-    T_odom_sensor = trajectory.at(stamps)
-    if (differ := _mean(mismatch(T_odom_sensor, hops))) > APART:
+    if (differ := _mean(mismatch(T_odom_sensor, hops))) > _APART:
         what = f"over some metres, most motions differ from the reference's by {differ:.0f} %"
-        return Finding((), what, "it is of another drive, or lost nearly everywhere")
-    return _of_ends(judge, stamps, span, T_odom_sensor, OF_OPTIONS)
+        return Finding((), what, "they are of another drive, or lost nearly everywhere")
+    ends_fit = _of_ends(judge, stamps, span, T_odom_sensor, _OPTIONS)
+    return None if ends_fit is None else ends_fit._replace(where=())
+
+
+def contradiction(scans: Recording, reference: Trajectory) -> Finding | None:
+    """Why a reference contradicts registrations of scans, see `diagnose_reference`."""
+    stamps: list[int] = []
+    passing = (stamps.append(scan.stamp) or scan for scan in scans)  # type: ignore[func-returns-value]
+    hops = measured_motions(passing, scans.n_messages)
+    deque(passing, 0)
+    return diagnose_reference(reference, np.array(stamps, np.int64), hops)
 
 
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

@@ -74,7 +74,8 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     by_length = {length: found.error(length) for length in LENGTHS}
     errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
     metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
-    gaps = [(*(round(second, 3) for second in g.seconds or ()), g.what) for g in found.gaps()]
+    spans = ((gap.seconds or (0.0, 0.0), gap.what) for gap in found.gaps())
+    gaps = [(round(begin, 3), round(end, 3), what) for (begin, end), what in spans]
     stored = StoredEstimate(path, about, len(found.stamps), metres, share, errors, gaps)
     path.parent.mkdir(parents=True, exist_ok=True)
     # What is known of an estimate before is not of these poses.
