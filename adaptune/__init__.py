@@ -1,6 +1,7 @@
 """What both stages share: the vocabulary, the data, the black boxes and the error model.
 
-`tune` does all of it in one call; see `adaptune.tuning.tuned.tune`.
+`tune` does all of it in one call, see `adaptune.tuning.tuned.tune`; `evaluate` judges trajectories,
+see `adaptune.evaluation.evaluated.evaluate`.
 """
 
 # The working folder may have a typing.py until `adaptune.__main__` has set the path.
@@ -10,11 +11,12 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> "Any":
-    if name == "tune":
+    if name in ("tune", "evaluate"):
         from importlib import import_module
 
-        # Layers below do not see it, though they import this package.
-        return import_module("adaptune.tuning.tuned").tune
+        # Layers below do not see them, though they import this package.
+        homes = {"tune": "adaptune.tuning.tuned", "evaluate": "adaptune.evaluation.evaluated"}
+        return getattr(import_module(homes[name]), name)
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import version

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from adaptune.study.study import Study
 from offline.config import load_study
 from online.record import StoredReplay
-from online.reference import Reference
+from online.reference import read_reference
 
 MODES = ("baseline", "fixed", "even", "adaptive", "untrained")
 
@@ -32,7 +32,7 @@ def driven(study: Study, mode: str) -> tuple[list[float], NDArray[np.float64]]:
     errors, told = [], []
     for name in study.config.test:
         folder = study.folder / "replays" / name
-        reference = Reference.read(study, name)
+        reference = read_reference(study, name)
         replay = StoredReplay.read(folder / mode)
         errors.append(float(np.nanmean(reference.errors(replay.trajectory))))
         at = np.searchsorted(replay.trajectory.stamps, replay.choice_stamps)

@@ -59,7 +59,7 @@ from offline.labelled import LabelledData, labelled_data
 from offline.train import train, trial_workers
 from online.modes import run_replays, run_untrained
 from online.record import StoredReplay
-from online.reference import Reference
+from online.reference import read_reference
 from online.statistics import ComparisonRow, compare_modes
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
@@ -166,7 +166,7 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
         folder = study.folder / "replays" / name
         also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
         replays = {mode: StoredReplay.read(folder / mode) for mode in (*MODES, *also)}
-        reference = Reference.read(study, name)
+        reference = read_reference(study, name)
         rows += compare_modes(name, replays, reference).rows
     return rows
 

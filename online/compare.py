@@ -15,6 +15,7 @@ from adaptune.model import ErrorModel, rules
 from adaptune.model.registry import ADAPTIVE
 from adaptune.paired import Ratio, ratio
 from adaptune.reference.check import hard_to_track
+from adaptune.reference.judge import StandardErrors
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
 from adaptune.study.driven import PER_STRETCH
@@ -32,7 +33,7 @@ from online.modes import (
     sequences_without_model,
 )
 from online.record import ReplaySummary, StoredReplay, StoredReplayError
-from online.reference import Reference, StandardErrors, check_reference, read_contradictions
+from online.reference import check_reference, read_contradictions, read_reference
 from online.statistics import (
     ALL,
     NO_DIFFERENCE,
@@ -303,7 +304,7 @@ def compare(study: Study) -> ComparedReplays:
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
-        reference = Reference.read(study, name)
+        reference = read_reference(study, name)
         stamps = next(iter(replays.values())).trajectory.stamps
         if len(stamps) > 1 and not any(replay.summary.real_time for replay in replays.values()):
             periods[name] = 1e-6 * float(np.median(np.diff(stamps)))

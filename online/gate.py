@@ -19,7 +19,7 @@ from adaptune.study.driven import PER_STRETCH
 from adaptune.study.study import Study, is_written_to
 from online.modes import BASELINE, FIXED
 from online.record import ReplaySummary, StoredReplay
-from online.reference import Reference
+from online.reference import read_reference
 from online.statistics import ALL
 from online.turns import COST, P99, Costs, Driven, cost_ratios
 
@@ -228,7 +228,7 @@ def _paired(sides: Sequence[Side], mode: str, both: tuple[Driven, Driven]) -> Pa
             f"{both[1].name}: {sides[1].name} gives no pose for {lacking} of {old.scans} scans, so "
             f"nothing compares with it; mend it, or leave the recording out"
         )
-    new, reference = both[0], Reference.read(sides[0].study, both[0].name)
+    new, reference = both[0], read_reference(sides[0].study, both[0].name)
     mine, other = (StoredReplay.read(one.folder / mode) for one in both)
     stamps = np.intersect1d(mine.trajectory.stamps, other.trajectory.stamps)
     kept = [(replay, np.isin(replay.trajectory.stamps, stamps)) for replay in (mine, other)]

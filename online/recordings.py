@@ -16,6 +16,7 @@ from adaptune.geometry import invert
 from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages
 from adaptune.recording.scan import Recording
+from adaptune.reference.judge import Reference
 from adaptune.selector import Periods
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
@@ -24,7 +25,7 @@ from online.compare import current_replays
 from online.live import Placed, RosMessages, placed
 from online.modes import replayed_modes, sequences_without_model
 from online.record import StoredReplay, StoredReplayError
-from online.reference import Reference, check_reference
+from online.reference import check_reference, read_reference
 
 CLOUD_PERIOD = 1.0
 """Seconds from one cloud to the next."""
@@ -95,7 +96,7 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
         raise StoredReplayError(refused[0][:-1])
     replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
     check_reference(folder, study.sequences.reference(name))
-    reference = Reference.read(study, name)
+    reference = read_reference(study, name)
     known = reference.trajectory
     paths = {mode: _placed(replay.trajectory, known) for mode, replay in replays.items()}
     placing = next((mode for mode in _PLACING if mode in modes), modes[0])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adaptune.geometry import invert
 from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
+from adaptune.reference.judge import Reference
 from adaptune.report.charts import Spans
 from adaptune.space import ParameterSpace
 from adaptune.study.driven import named
@@ -19,7 +20,7 @@ from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_replays
 from online.modes import BASELINE, FIXED, UNTRAINED
 from online.record import StoredReplay
-from online.reference import Reference, check_reference
+from online.reference import check_reference, read_reference
 
 
 def scene_spans(
@@ -96,7 +97,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     AdaptuneError
         If a file is damaged, or if `compare` refuses all of them.
     """
-    folder, reference = study.folder / "replays" / name, Reference.read(study, name)
+    folder, reference = study.folder / "replays" / name, read_reference(study, name)
     current = current_replays(study, [name])
     if current.modes:
         check_reference(folder, study.sequences.reference(name))

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from adaptune.metrics import cap
 from adaptune.paired import Interval, Pair, Ratio, interval_of_mean, ratio
+from adaptune.reference.judge import Reference, StandardErrors, columns_of
 from adaptune.study.oracle import OracleErrors
 from adaptune.trajectory import Trajectory
 from online.record import StoredReplay, switched
-from online.reference import Reference, StandardErrors
 
 ALL = "all"
 """In place of a sequence, all of them."""
@@ -100,15 +100,8 @@ class ComparisonRow:
 
     def standard_columns(self, kitti: bool = True) -> dict[str, Any]:
         """The row of a table of the errors that other tools give, with KITTI's or without."""
-        ape, rpe, height, percent, degrees, listed = self._standard().values()
-        of_evo = {"mode": self.mode, "APE [m]": ape, "RPE [m]": rpe, "height [%]": height}
-        lengths = (listed or "").split()
-        of_kitti = {
-            "KITTI [%]": percent,
-            "[deg/100 m]": None if degrees is None else 100.0 * degrees,
-            "over [m]": "-".join(dict.fromkeys([*lengths[:1], *lengths[-1:]])) or None,
-        }
-        return of_evo | of_kitti if kitti else of_evo
+        shown = columns_of(self.standard)
+        return {"mode": self.mode} | dict([*shown.items()][: None if kitti else 3])
 
     def summary_columns(self) -> dict[str, Any]:
         """The row of the table of the modes, over all sequences or on the only one."""

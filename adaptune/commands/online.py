@@ -302,7 +302,7 @@ def _gate(
     from online.gate import compare_sides, shared_replays, write_gate
 
     error, cost = (
-        math.inf if (key, text) == ("cost", "off") else _share_of(text, key)
+        math.inf if (key, text) == ("cost", "off") else share_of(text, key)
         for key, text in zip(("worse", "cost"), percents, strict=True)
     )
     with progress() as show:
@@ -319,7 +319,8 @@ def _gate(
         raise typer.Exit(WORSE)
 
 
-def _share_of(text: str, key: str) -> float:
+def share_of(text: str, key: str) -> float:
+    """A percentage of an option, as a share."""
     with suppress(ValueError):
         if 0.0 <= (share := float(text.removesuffix("%")) / 100.0) < math.inf:
             return share

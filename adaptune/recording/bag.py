@@ -30,6 +30,7 @@ from adaptune.recording.pose_messages import (
     POSES,
     STATIC,
     TRANSFORMS,
+    chained,
     message_stamp,
     of_frame,
     untimed,
@@ -307,25 +308,46 @@ class BagSource:
         first = self.begins.get(self.points)
         return None if first is None else (first, first + self._duration)
 
-    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Poses on a topic, those with the same stamp once; of paths, the last one recorded."""
+    def poses(
+        self, name: str | None, child_frame: str | None, strict: bool = False
+    ) -> Trajectory | None:
+        """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
+
+        The frame of transforms may be a chain, as ``map.base_link``. Of two nodes that publish on
+        a topic, the one with more poses counts, or if `strict` none.
+        """
         if name is None:
             return None
         name = self.topic(name, POSES, "poses")
         messages = self.messages(name, last=self.topics[name] == PATH)
         found = [pose for message in messages for pose in POSES[message.__msgtype__](message)]
+        if self.topics[name] in TRANSFORMS and "." in (child_frame or ""):
+            return self._chain(name, str(child_frame))
         if self.topics[name] in TRANSFORMS:
             found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
             raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
         if what := untimed(found):
             raise SequenceError(f"{self.name}: {name}: {what}; name another `reference`")
+        if strict and len(frames := sorted({frame for _, frame, *_ in found})) > 1:
+            what = f"has poses of {' and '.join(map(repr, frames))}: two nodes publish there"
+            raise SequenceError(f"{self.name}: {name} {what}; record each on a topic of its own")
         trajectory, left_out = usable(found)
         if trajectory is None:
             raise SequenceError(f"{self.name}: {name}: {left_out[-1]}")
         for what in left_out:
             _log.warning("%s: %s: %s; they are left out", self.name, name, what)
         return trajectory
+
+    def _chain(self, name: str, frames: str) -> Trajectory:
+        """Poses along a chain of transforms, which may be fixed in part."""
+        every = [t for message in self.messages(name) for t in message.transforms]
+        fixed = self.messages(STATIC) if self.topics.get(STATIC) in TRANSFORMS else ()
+        always = [t for message in fixed for t in message.transforms]
+        try:
+            return chained(every, always, *frames.split(".", 1))
+        except ValueError as error:
+            raise SequenceError(f"{self.name}: {name}: {error}") from error
 
     def fixed_frames(self) -> tuple[str, dict[str, tuple[str, list[float]]]]:
         """The clouds' frame, and frames of ``/tf_static``, each with its parent and pose in that.

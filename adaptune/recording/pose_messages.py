@@ -45,6 +45,7 @@ POSES: dict[str, Callable[[Any], list[Pose]]] = {
 # Each message of this type repeats all poses of the one before.
 PATH = "nav_msgs/msg/Path"
 STATIC = "/tf_static"
+_BEGIN, _END, _FOREVER = 0, 4 * 10**18, 5e9  # nanoseconds of fixed transforms, and seconds
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -52,7 +53,7 @@ def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]
     """Poses of one child frame; of the only one if `frame` is None, else a SequenceError."""
     frames = sorted({name for _, name, *_ in poses})
     if frame is None and len(frames) > 1:
-        help_ = f"name one of them as `child_frame`: {', '.join(frames)}"
+        help_ = f"name one of them as `child_frame`, or a chain: {', '.join(frames)}"
         raise SequenceError(f"{topic} has the transforms of several frames, {help_}")
     if frame is not None and frame not in frames:
         raise SequenceError(f"{topic}: no frame {frame}; {nearest(frame, frames)}")
@@ -91,3 +92,35 @@ def untimed(poses: Sequence[Pose]) -> str:
     """What is wrong with poses whose stamps were never set; empty for others."""
     first, same = poses[0][0], len({stamp for stamp, *_ in poses}) == 1 < len(poses)
     return f"all its {len(poses)} poses have the stamp {first * 1e-9:.10g} s" if same else ""
+
+
+def chained(moving: Sequence[Any], fixed: Sequence[Any], parent: str, child: str) -> Trajectory:
+    """Poses of a frame in another one, at the stamps of the link that moves most often.
+
+    `moving` and `fixed` are transforms. A ValueError says why there is no chain.
+    """
+    links: dict[str, tuple[str, list[Pose]]] = {}
+    for t in (*fixed, *moving):
+        above, below = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
+        if links.setdefault(below, (above, []))[0] != above:
+            both = f"{links[below][0]} and {above}"
+            raise ValueError(f"{below} has two parents, {both}: two nodes publish it; record one")
+        links[below][1].extend(_transforms([t]))
+    for t in fixed:
+        _, poses = links[t.child_frame_id.lstrip("/")]
+        poses[:] = [(stamp, *poses[-1][1:]) for stamp in (_BEGIN, _END)]
+    way, frame = list[Trajectory](), child.lstrip("/")
+    while frame != parent.lstrip("/") or not way:
+        if frame not in links or len(way) > len(links):
+            known = ", ".join(sorted({*links, *(above for above, _ in links.values())}))
+            raise ValueError(f"no chain leads from {parent} to {child}; there is {known}")
+        frame, poses = links[frame]
+        if (link := usable(poses)[0]) is None:
+            raise ValueError(f"{poses[0][1]} has no pose that is finite")
+        way.append(link)
+    stamps = max((link.stamps for link in way), key=len)
+    T = np.eye(4)
+    for link in reversed(way):
+        T = T @ link.at(stamps, _FOREVER)
+    known_poses = np.isfinite(T[:, 0, 0])
+    return Trajectory(stamps[known_poses], T[known_poses])

@@ -26,20 +26,24 @@ _SAID = 3  # stretches that are told one by one
 
 
 def sound(
-    reference: Trajectory, begin: int | None = None, hole: float = 0.0
+    reference: Trajectory,
+    begin: int | None = None,
+    hole: float = 0.0,
+    name: str = "the reference",
 ) -> tuple[Trajectory, list[Finding]]:
     """The poses without those that no robot can have had, and what was wrong with them.
 
     A pose that is repeated while the robot moves is left out. At a jump a gap of more than
     `max_gap`, and of `hole` seconds at least, is left: no sub-trajectory crosses it. Seconds of the
-    findings count from `begin`, in nanoseconds, by default from the first pose.
+    findings count from `begin`, in nanoseconds, by default from the first pose; the text
+    calls the poses `name`.
     """
     begin = int(reference.stamps[0]) if begin is None else begin
     lost = _repeated(reference)
-    found = _in_words("repeats a pose while the robot moves", reference, lost, begin)
+    found = _in_words(f"{name} repeats a pose while the robot moves", reference, lost, begin)
     reference = _without(reference, lost)
     if metres := _to_and_fro(reference):
-        what = f"the reference goes to and fro by {metres:.2g} m from pose to pose"
+        what = f"{name} goes to and fro by {metres:.2g} m from pose to pose"
         mend = (
             "it is noise, or two nodes publish it by turns: name the poses of one of them, or use "
             "`reference: estimated`"
@@ -53,7 +57,7 @@ def sound(
     for start, end in jumps.tolist():
         after = max(end, start + round(max(gap, hole) * 1e9) + 1)
         lost |= (reference.stamps > start) & (reference.stamps < after)
-    found += _in_words(f"jumps by up to {metres:.3g} m (or radians)", reference, lost, begin)
+    found += _in_words(f"{name} jumps by up to {metres:.3g} m (or radians)", reference, lost, begin)
     return _without(reference, lost, gap if lost.any() else None), found
 
 
@@ -91,7 +95,7 @@ def _in_words(
     spans = reference.stamps[(edges - (1, 0)).clip(max=len(reference) - 1)]
     if len(spans) > _SAID:
         what, spans = f"{what} ({len(spans)} times)", np.array([[spans[0, 0], spans[-1, 1]]])
-    what, mend = f"the reference {what}", "these poses are left out"
+    mend = "these poses are left out"
     seconds = ((spans - begin) * 1e-9).tolist()
     return [Finding((), what, mend, (start, end), of="reference") for start, end in seconds]
 

@@ -328,7 +328,7 @@ class RecordedSequence:
         if config.reference in (ESTIMATED, NO_REFERENCE):
             return None
         if config.poses_file is not None:
-            trajectory: Trajectory | None = self._from_file(config.poses_file)
+            trajectory: Trajectory | None = self.from_file(config.poses_file)
         else:
             trajectory = self.source.poses(config.poses_topic, config.child_frame)
         if trajectory is None:
@@ -368,7 +368,8 @@ class RecordedSequence:
                 f"scans of {self.name}; give a file with stamps (TUM)"
             )
 
-    def _from_file(self, path: Path) -> Trajectory:
+    def from_file(self, path: Path) -> Trajectory:
+        """The poses of a file; those without stamps are one for each scan."""
         try:
             if not is_kitti(path):
                 return read_trajectory(path)
@@ -384,22 +385,26 @@ class RecordedSequence:
         """The poses that a robot can have had; a SequenceError if they are of another time."""
         if len(trajectory) > 1 and (angles := in_angles(trajectory)) is not None:
             raise SequenceError(f"{self.name}: {angles}")
-        span = self.source.span()
-        if span is None:
+        self.check_time(trajectory)
+        if (span := self.source.span()) is None:
             return trajectory
-        begin, end = trajectory.stamps[0], trajectory.stamps[-1]
-        if begin <= span[1] and end >= span[0]:
-            # A gap shorter than the time between two scans would not be noticed.
-            period = self._seconds / max(self.source.n_messages, 1)
-            trajectory, found = sound(trajectory, span[0], 1.5 * period)
-            for finding in found:
-                _warn(self.name, str(finding))
-            return trajectory
+        # A gap shorter than the time between two scans would not be noticed.
+        period = self._seconds / max(self.source.n_messages, 1)
+        trajectory, found = sound(trajectory, span[0], 1.5 * period)
+        for finding in found:
+            _warn(self.name, str(finding))
+        return trajectory
+
+    def check_time(self, trajectory: Trajectory, what: str = "the reference") -> None:
+        """Refuse poses of another time than the scans, by a SequenceError that says by how much."""
+        span, (begin, end) = self.source.span(), trajectory.stamps[[0, -1]].tolist()
+        if span is None or (begin <= span[1] and end >= span[0]):
+            return
         times = [f"{stamp * 1e-9:.3f} s" for stamp in (begin, end, *span)]
         raise SequenceError(
-            f"{self.name}: the reference covers {times[0]} to {times[1]}, the scans cover "
-            f"{times[2]} to {times[3]}: set `clock_offset` to the seconds to add to the "
-            f"reference's stamps{self._proposal(trajectory)}"
+            f"{self.name}: {what} covers {times[0]} to {times[1]}, the scans cover "
+            f"{times[2]} to {times[3]}: set `clock_offset` to the seconds to add to its stamps"
+            f"{self._proposal(trajectory)}"
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:

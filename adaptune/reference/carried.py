@@ -117,8 +117,14 @@ def begin_of(scans: Recording, stamps: NDArray[np.int64]) -> int:
 
 def may_be_carried(T_ref_sensor: Poses, T_odom_sensor: Poses) -> bool:
     """Whether an odometry stands still somewhere while the reference moves; (n, 4, 4) each."""
+    return bool(stands(T_ref_sensor, T_odom_sensor).any())
+
+
+def stands(T_ref_sensor: Poses, T_odom_sensor: Poses) -> NDArray[np.bool_]:
+    """From which poses on an odometry stands still while the reference moves, of shape (n,)."""
     ends = window_ends(T_ref_sensor, 2.0 * _NEAR)
-    starts = np.flatnonzero(ends >= 0)
+    starts, still = np.flatnonzero(ends >= 0), np.zeros(len(ends), bool)
     ways = (T[ends[starts], :3, 3] - T[starts, :3, 3] for T in (T_ref_sensor, T_odom_sensor))
     moved, others = (np.linalg.norm(way, axis=1) for way in ways)
-    return bool(((moved > _NEAR) & (others < _STANDS * moved)).any())
+    still[starts] = (moved > _NEAR) & (others < _STANDS * moved)
+    return still

@@ -26,7 +26,7 @@ from adaptune.geometry import (
     to_quaternions,
 )
 from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Hops, register
-from adaptune.metrics import sub_trajectory_rte
+from adaptune.metrics import sub_trajectory_rte, window_ends
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.content import Content
 from adaptune.recording.scan import Recording, Scan
@@ -133,7 +133,35 @@ def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Findin
 
 
 UNEXPLAINED = ", which none of the known causes explains"
-_OWN = "that is the odometry's own error, and no convention: tuning may lessen it"
+
+
+class Mends(NamedTuple):
+    """What mends poses, as who gives them is told; braces stand for the value that was found."""
+
+    clock: str = "add {:.3f} to `clock_offset`"
+    place: str = "set `extrinsic: [{}]`, the LiDAR's pose in their frame"
+    own: str = "no setting mends that: calibrate what made them, or use `reference: estimated`"
+    rare: str = "give more poses a second, or use `reference: estimated`"
+    unturned: str = "use `reference: estimated`"
+    ends: str = (
+        "a system that gives the pose of a scan's end needs odometry.settings.pose_time: end; if "
+        "it does not, the reference is of another clock (`clock_offset`)"
+    )
+
+
+_OF_STUDY = Mends()
+_OF_ODOMETRY = Mends(
+    place="return the LiDAR's poses: multiply by its place in the body, {}",
+    own="that is the odometry's own error, and no convention: tuning may lessen it",
+)
+_OPTIONS = Mends(
+    clock="add {:.3f} to `--clock-offset`",
+    place='give `--extrinsic "{}"`, the LiDAR\'s pose in their frame',
+    own="that is its own error, and no option mends it",
+    rare="write more poses a second",
+    unturned="write the orientations, too",
+    ends="if they are of scans' ends, give `--pose-time end`",
+)
 
 
 class _Candidate(NamedTuple):
@@ -165,7 +193,11 @@ def _mean(errors: NDArray[np.float64]) -> float:
 
 
 def diagnose_reference(
-    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, place: Poses | None = None
+    reference: Trajectory,
+    stamps: NDArray[np.int64],
+    hops: Hops,
+    place: Poses | None = None,
+    mends: Mends = _OF_STUDY,
 ) -> Finding | None:
     """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
 
@@ -180,21 +212,19 @@ def diagnose_reference(
     given = reference.T_world_sensor @ invert(T_given_sensor)
     turned = rotation_angle(invert(given[:1]) @ given).max()
     if turned < 1e-6 and rotation_angle(hops.T_start_end).max() > np.radians(2.0):
-        mend = "use `reference: estimated`"
-        return _cause("without orientation (all are alike)", mend, before)
+        return _cause("without orientation (all are alike)", mends.unturned, before)
 
     def at_scans(T_world_given: Poses) -> Poses:
         T = T_world_given @ T_given_sensor
         return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
 
     T_world_body = at_scans(given) @ invert(T_given_sensor)
-    calibrate = "no setting mends that: calibrate what made them, or use `reference: estimated`"
     candidates = [
         *(c._replace(T_world_sensor=at_scans(c.T_world_sensor)) for c in _conventions(given)),
-        *_far_apart(reference, stamps),
-        *_clock(reference, stamps, hops),
-        *_scales(T_world_body, hops, T_given_sensor, calibrate),
-        *_places(T_world_body, hops),
+        *_far_apart(reference, stamps, mends),
+        *_clock(reference, stamps, hops, mends),
+        *_scales(T_world_body, hops, T_given_sensor, mends),
+        *_places(T_world_body, hops, mends),
     ]
     return _likeliest(candidates, hops, errors)
 
@@ -214,8 +244,8 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
             np.array([*accumulate(safe, np.matmul)]),
         ),
         *_conventions(T_odom_sensor),
-        *_scales(T_odom_sensor, hops, np.eye(4), _OWN),
-        *_places(T_odom_sensor, hops, of_odometry=True),
+        *_scales(T_odom_sensor, hops, np.eye(4), _OF_ODOMETRY),
+        *_places(T_odom_sensor, hops, _OF_ODOMETRY),
     ]
     # What is left may be the odometry's own error.
     return _likeliest([c._replace(most=EXPLAINED) for c in candidates], hops, errors)
@@ -262,7 +292,9 @@ def _conventions(T: Poses) -> Iterator[_Candidate]:
         yield _Candidate(what, mend, T_right)
 
 
-def _far_apart(reference: Trajectory, stamps: NDArray[np.int64]) -> Iterator[_Candidate]:
+def _far_apart(
+    reference: Trajectory, stamps: NDArray[np.int64], mends: Mends
+) -> Iterator[_Candidate]:
     """Poses too rare to go straight from one to the next: on a smooth way through them."""
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import RotationSpline
@@ -277,10 +309,12 @@ def _far_apart(reference: Trajectory, stamps: NDArray[np.int64]) -> Iterator[_Ca
     T[known, :3, :3] = RotationSpline(seconds, R)(at).as_matrix()
     T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
     what = f"too rare: one every {every:.2g} s, and a straight way for the scans in between"
-    yield _Candidate(what, "give more poses a second, or use `reference: estimated`", T, EXPLAINED)
+    yield _Candidate(what, mends.rare, T, EXPLAINED)
 
 
-def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
+def _clock(
+    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, mends: Mends
+) -> Iterator[_Candidate]:
     """The reference by another clock, found by how fast both turn and move."""
     turned, moved = _turned_moved(hops.T_start_end)
     seconds = 1e-9 * (stamps[hops.end] - stamps[hops.start])
@@ -312,7 +346,7 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
     best = float(minimize_scalar(left, bounds=bounds, method="bounded", options=options).x)
     if abs(best) < SAME_CLOCK:
         return
-    mend = f"add {best:.3f} to `clock_offset`"
+    mend = mends.clock.format(best)
     yield _Candidate("like those of another clock", mend, shifted(best, stamps))
 
 
@@ -322,7 +356,7 @@ def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _scales(
-    T_world_body: Poses, hops: Hops, T_body_sensor: Poses, mend: str
+    T_world_body: Poses, hops: Hops, T_body_sensor: Poses, mends: Mends
 ) -> Iterator[_Candidate]:
     """Poses in other units, or whose ways or turns are too long, or with a drift of their turns."""
     known = np.flatnonzero(np.isfinite(T_world_body[:, 0, 0]))
@@ -356,14 +390,14 @@ def _scales(
         causes.append((what, turning_less(0.0, rate)))
     for what, poses in causes:
         if what:
-            yield _Candidate(what, mend, poses @ T_body_sensor, EXPLAINED)
+            yield _Candidate(what, mends.own, poses @ T_body_sensor, EXPLAINED)
         way = _turned_moved(invert(poses[start]) @ poses[end])[1]
         scale = float(np.median(way / np.maximum(far, 1e-9)))
         if scale > 0.0 and abs(scale - 1.0) > SAME:
             scaled = poses.copy()
             scaled[:, :3, 3] /= scale
             said = f"{what}{', and ' * bool(what)}{scale:.4g} times as long as the scans' way"
-            found = _Candidate(said, mend, scaled @ T_body_sensor, EXPLAINED)
+            found = _Candidate(said, mends.own, scaled @ T_body_sensor, EXPLAINED)
             if not what and np.abs(np.abs(np.log(scale)) - np.log(UNITS)).min() < UNLIKE:
                 found = found._replace(mend="write the positions in metres", most=SET_RIGHT)
             yield found
@@ -373,7 +407,7 @@ def _rotation_vectors(T: Poses) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_matrix(T[:, :3, :3]).as_rotvec())
 
 
-def _places(T_world_body: Poses, hops: Hops, of_odometry: bool = False) -> Iterator[_Candidate]:
+def _places(T_world_body: Poses, hops: Hops, mends: Mends) -> Iterator[_Candidate]:
     """The poses of another body of the same platform."""
     T = invert(T_world_body[hops.start]) @ T_world_body[hops.end]
     known = np.isfinite(T).all(axis=(1, 2))
@@ -396,14 +430,11 @@ def _places(T_world_body: Poses, hops: Hops, of_odometry: bool = False) -> Itera
         place[:3, :3], place[:3, 3] = R, t
         if (place == np.eye(4)).all():
             continue
-        numbers = " ".join(
+        numbers = ", ".join(
             f"{value + 0.0:.4g}"
             for value in (*t.round(3), *to_quaternions(place[None])[0].round(4))
         )
-        mend = f"set `extrinsic: [{numbers.replace(' ', ', ')}]`, the LiDAR's pose in their frame"
-        if of_odometry:
-            mend = f"return the LiDAR's poses: multiply by its place in the body, {numbers}"
-        yield _Candidate(what, mend, T_world_body @ place)
+        yield _Candidate(what, mends.place.format(numbers), T_world_body @ place)
 
 
 def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:
@@ -498,7 +529,11 @@ def _unexplained(wrong: float, others: float) -> Finding:
 
 
 def _of_ends(
-    reference: Trajectory, stamps: NDArray[np.int64], span: float, T_odom_sensor: Poses
+    reference: Trajectory,
+    stamps: NDArray[np.int64],
+    span: float,
+    T_odom_sensor: Poses,
+    mends: Mends = _OF_STUDY,
 ) -> Finding | None:
     """Whether an odometry's poses fit the reference best about one scan later than their stamps."""
     shares = (0.0, 1.0, -1.0, -0.5, 0.5, 1.5, 2.0)
@@ -510,11 +545,47 @@ def _of_ends(
         f"they fit the reference best {1e-9 * span:.2g} s, about one scan, after their stamps "
         f"({errors[1]:.3g} % over {END_LENGTH:g} m instead of {errors[0]:.3g} %)"
     )
-    mend = (
-        "a system that gives the pose of a scan's end needs odometry.settings.pose_time: end; if "
-        "it does not, the reference is of another clock (`clock_offset`)"
-    )
-    return Finding(("the odometry's poses",), what, mend, of="reference")
+    return Finding(("the odometry's poses",), what, mends.ends, of="reference")
+
+
+_APART = 50.0  # percent by which most motions of another drive differ, or of a lost odometry
+_EVENLY = 100  # motions of a reference that say what other poses are
+
+
+def diagnose_trajectory(
+    trajectory: Trajectory,
+    judge: Trajectory,
+    stamps: NDArray[np.int64],
+    span: float,
+    place: Poses | None = None,
+) -> Finding | None:
+    """What poses are that a trusted reference contradicts; None if it does not, or nobody can tell.
+
+    The stamps, of shape (n,), are where both are compared; `span` is how many nanoseconds a scan
+    takes, and `place` is as in `diagnose_reference`.
+    """
+    T_ref_sensor, T_odom_sensor = judge.at(stamps), trajectory.at(stamps)
+    ends = window_ends(T_ref_sensor, _METRES)
+    starts = np.flatnonzero(ends >= 0)
+    starts = starts[:: max(1, len(starts) // _EVENLY)]
+    T = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends[starts]]
+    hops = Hops(starts, ends[starts], T, np.tile(np.eye(3), (len(starts), 1, 1)))
+    if (cause := diagnose_reference(trajectory, stamps, hops, place, _OPTIONS)) is not None:
+        return cause._replace(what=cause.what.replace("registrations of scans", "the reference"))
+    if (differ := _mean(mismatch(T_odom_sensor, hops))) > _APART:
+        what = f"over some metres, most motions differ from the reference's by {differ:.0f} %"
+        return Finding((), what, "they are of another drive, or lost nearly everywhere")
+    ends_fit = _of_ends(judge, stamps, span, T_odom_sensor, _OPTIONS)
+    return None if ends_fit is None else ends_fit._replace(where=())
+
+
+def contradiction(scans: Recording, reference: Trajectory) -> Finding | None:
+    """Why a reference contradicts registrations of scans, see `diagnose_reference`."""
+    stamps: list[int] = []
+    passing = (stamps.append(scan.stamp) or scan for scan in scans)  # type: ignore[func-returns-value]
+    hops = measured_motions(passing, scans.n_messages)
+    deque(passing, 0)
+    return diagnose_reference(reference, np.array(stamps, np.int64), hops)
 
 
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

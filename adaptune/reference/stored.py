@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -29,6 +30,8 @@ class StoredEstimate(NamedTuple):
     metres: float  # length of its path
     unknown_share: float  # share of the scans whose pose is unknown
     errors: dict[float, float]  # its mean RTE in percent, by the length of sub-trajectories
+    # From when to when it is unknown, and why; seconds since the first scan.
+    unknown: Sequence[tuple[float, float, str]] = ()
 
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
@@ -53,7 +56,10 @@ class StoredEstimate(NamedTuple):
                 return None
             errors = {float(length): float(e) for length, e in known["error_percent"].items()}
             numbers = int(known["scans"]), float(known["metres"]), float(known["unknown_share"])
-            return cls(path, dict(known["about"]), *numbers, errors)
+            unknown = [
+                (float(a), float(b), str(why)) for a, b, why in known.get("unknown_seconds", ())
+            ]
+            return cls(path, dict(known["about"]), *numbers, errors, unknown)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -68,17 +74,16 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     by_length = {length: found.error(length) for length in LENGTHS}
     errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
     metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
-    stored = StoredEstimate(path, about, len(found.stamps), metres, share, errors)
+    spans = ((gap.seconds or (0.0, 0.0), gap.what) for gap in found.gaps())
+    gaps = [(round(begin, 3), round(end, 3), what) for (begin, end), what in spans]
+    stored = StoredEstimate(path, about, len(found.stamps), metres, share, errors, gaps)
     path.parent.mkdir(parents=True, exist_ok=True)
     # What is known of an estimate before is not of these poses.
     path.with_suffix(".json").unlink(missing_ok=True)
     draw_chart(estimate_chart(path.stem, found), path.with_suffix(".png"))
     write_tum(path, found.trajectory())
-    known = stored._asdict() | {"error_percent": stored.errors}
-    known["unknown_seconds"] = [
-        [*(round(second, 3) for second in gap.seconds or ()), gap.what] for gap in found.gaps()
-    ]
-    del known["path"], known["errors"]
+    known = stored._asdict() | {"error_percent": errors, "unknown_seconds": gaps}
+    del known["path"], known["errors"], known["unknown"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
     return stored
 

@@ -110,13 +110,19 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
         )
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
     check_alike(inspections)
+    named = by_name(inspections)
+    return named, list(named)[len(paths) - len(tested) :]
+
+
+def by_name(inspections: "Sequence[Inspection]") -> "dict[str, Inspection]":
+    """Recordings by the names of their sequences, of which no two are the same."""
     named: dict[str, Inspection] = {}
     for inspection in inspections:
         path = inspection.path
         longer = plain_name(path.with_name(f"{path.parent.name}_{path.name}"))
         names = chain([inspection.name, longer], (f"{inspection.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = inspection
-    return named, list(named)[len(paths) - len(tested) :]
+    return named
 
 
 def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":

@@ -18,7 +18,7 @@ from offline.config import load_study
 from online.compare import NONE, compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
-from online.reference import Reference
+from online.reference import read_reference
 from online.replayed import read_replays
 from online.statistics import ComparisonRow
 from online.verdict import remarks
@@ -206,7 +206,7 @@ def test_frames_in_a_gap_of_the_reference_have_no_error(own, study_file, tmp_pat
         stamps = StoredReplay.read(own.folder / "replays/three/fixed").trajectory.stamps
         in_training = np.isnan(study.sequences.open("three").reference().at(stamps)[:, 0, 0])
         assert np.count_nonzero(in_training) == unknown
-        compared = np.isnan(Reference.read(study, "three").trajectory.at(stamps)[:, 0, 0])
+        compared = np.isnan(read_reference(study, "three").trajectory.at(stamps)[:, 0, 0])
         np.testing.assert_array_equal(compared, in_training)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from adaptune.metrics import KittiError
+from adaptune.reference.judge import StandardErrors
 from online.modes import MODES
-from online.reference import StandardErrors
 from online.statistics import ALL, ORACLE, ComparisonRow
 from online.tables import modes_in_words, tables
 

@@ -1,0 +1,1 @@
+"""How good trajectories are: of any system, on recordings with ground truth or without."""

@@ -1,0 +1,225 @@
+"""Evaluate trajectories in one call: find the judge, judge, compare, and write the page."""
+
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from adaptune.errors import AdaptuneError
+from adaptune.evaluation.given import Convention, Named, name_of, read
+from adaptune.evaluation.judged import Judge, Judged, pair_of
+from adaptune.evaluation.shown import Compared, in_words, write_evaluation
+from adaptune.geometry import to_pose
+from adaptune.paired import ratio
+from adaptune.progress import Progress, bars_and_words
+from adaptune.recording.config import ESTIMATED
+from adaptune.recording.fleet import recordings_at
+from adaptune.recording.recording import RecordedSequence, wants_estimate
+from adaptune.reference.check import measure_reference, proposed_sub_trajectory
+from adaptune.reference.diagnosis import contradiction, diagnose_trajectory
+from adaptune.reference.judge import Reference
+from adaptune.study.references import ensure_references
+from adaptune.study.sequences import StudySequences
+from adaptune.trajectory import Trajectory, read_trajectory
+from adaptune.tuning.asked import by_name, usable
+
+if TYPE_CHECKING:
+    from adaptune.recording.fleet import Reading
+    from adaptune.recording.inspect import Inspection
+
+OUT = Path("runs/evaluate")
+_OWN = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+"""Poses that systems seldom publish: where a bag has one such topic, it is its reference."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation:
+    """What an evaluation has found."""
+
+    judged: Sequence[Judged]  # the worst first
+    pairs: Sequence[Compared]  # the best trajectory against each other one
+    page: Path  # HTML, with all charts and tables
+
+    @property
+    def words(self) -> list[str]:
+        """What was found, in at most five sentences."""
+        return in_words(self.judged, self.pairs)
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for each trajectory on each recording, as for ``pandas.DataFrame``."""
+        return [{key.lstrip("_"): v for key, v in one.row.items()} for one in self.judged]
+
+    def verdict(self, most: float) -> Literal["above", "below", "unclear"]:
+        """Whether any error is surely above so many percent, or surely none is."""
+        ends = [one.interval or (0.0, math.inf) for one in self.judged]
+        if any(low > most for low, _ in ends):
+            return "above"
+        return "below" if all(high <= most for _, high in ends) else "unclear"
+
+    def __repr__(self) -> str:
+        return f"<Evaluation: {' '.join(self.words)} More: {self.page}>"
+
+
+def evaluate(
+    recordings: str | Path | Sequence[str | Path],
+    *trajectories: Named,
+    reference: str | Path | None = None,
+    points: str | None = None,
+    extrinsic: Any = None,
+    clock_offset: float = 0.0,
+    pose_time: Literal["stamp", "end"] = "stamp",
+    sub_trajectory: float | None = None,
+    reading: "Reading | None" = None,
+    out: str | Path = OUT,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Say how wrong trajectories are, as the command `evaluate` does, without ground truth, too.
+
+    An AdaptuneError says what to do about a recording, a trajectory or a reference.
+
+    Parameters
+    ----------
+    recordings
+        Bags, or folders of them; `reading`, ``"one"`` or ``"several"``, says how to read these.
+    trajectories
+        Files; topics, also of other bags (``"run2.bag:/odom"``); chains of transforms
+        (``"/tf:map.base_link"``); `Trajectory` objects; or pairs of stamps (nanoseconds, or
+        seconds) and poses of shape (n, 4, 4).
+    reference, points
+        What judges, where not the recording's own poses: a topic, a file, or ``"estimated"``; and
+        the topic of the scans, where there are several.
+    extrinsic, clock_offset, pose_time
+        The LiDAR's pose in the poses' frame, as ``x y z qx qy qz qw`` or a matrix; the seconds to
+        add to their stamps; and ``"end"`` if they are of the ends of scans.
+    sub_trajectory
+        Metres over which errors are measured; by default as the length of the path allows.
+    out, progress
+        Folder of the page, the tables and the estimated references; and what is called with how
+        far each task is, by default bars.
+    """
+    try:
+        place = None if extrinsic is None else to_pose(extrinsic)
+    except ValueError as error:
+        raise AdaptuneError(f"extrinsic: {error}") from error
+    wrong = {
+        "name a trajectory: a file of poses, or a topic": not trajectories,
+        f"pose_time: give stamp or end, not {pose_time}": pose_time not in ("stamp", "end"),
+        "sub_trajectory: give metres, more than 0": not (sub_trajectory or 1.0) > 0.0,
+    }
+    for words in (words for words, is_wrong in wrong.items() if is_wrong):
+        raise AdaptuneError(words)
+    given = [recordings] if isinstance(recordings, str | Path) else recordings
+    paths = recordings_at(list(map(Path, given)), reading)
+    for one in (reference, *trajectories) if len(paths) > 1 else ():
+        if not (one in (None, ESTIMATED) or (isinstance(one, str) and one[:1] == "/")):
+            what = f"is of one recording, and there are {len(paths)}; name topics that each has"
+            raise AdaptuneError(f"{name_of(one)}: {what}")
+    asked = _Asked(
+        trajectories,
+        None if reference is None else str(reference),
+        sub_trajectory,
+        Convention(place, clock_offset, pose_time),
+        Path(out),
+    )
+    with ExitStack() as stack:
+        show = progress or stack.enter_context(bars_and_words())
+        judge = asked.reference or ESTIMATED
+        named = by_name([usable(path, points, judge, show) for path in paths])
+        judged = [o for n, found in named.items() for o in _of_recording(n, found, asked, show)]
+    judged.sort(key=lambda one: -one.rte)
+    pairs = _pairs(judged)
+    return Evaluation(judged, pairs, write_evaluation(asked.out, judged, pairs))
+
+
+class _Asked(NamedTuple):
+    trajectories: Sequence[Named]
+    reference: str | None
+    length: float | None
+    by: Convention
+    out: Path
+
+
+def _of_recording(name: str, found: "Inspection", asked: _Asked, show: Progress) -> list[Judged]:
+    """All trajectories of a recording, judged."""
+    if asked.reference is None:
+        found.given["reference"] = _own_reference(found, asked.trajectories)
+    scans, span = RecordedSequence(found.config()), found.scan.span if found.scan else 0
+    # A trajectory that cannot be read is told before a reference is estimated.
+    poses = [read(given, scans, asked.by, span) for given in asked.trajectories]
+    judge = _judge(name, found, scans, asked, show)
+    judged = []
+    for number, (given, trajectory) in enumerate(zip(asked.trajectories, poses, strict=True), 1):
+        stamps, place = judge.stamps(trajectory), asked.by.T_body_sensor
+        cause = diagnose_trajectory(trajectory, judge.trajectory, stamps, span, place)
+        cause = None if judge.doubt else cause
+        judged.append(Judged(name_of(given, number), judge, trajectory, stamps, cause))
+    return judged
+
+
+def _own_reference(found: "Inspection", trajectories: Sequence[Named]) -> str | None:
+    """The recording's own poses, where they are not among what is judged; else an estimate."""
+    if found.reference is not None and "reference" not in found.used:
+        return None  # those of a folder
+    own = [topic.name for topic in found.topics.values() if topic.type in _OWN]
+    return own[0] if len(own) == 1 and own[0] not in trajectories else ESTIMATED
+
+
+def _judge(
+    name: str, found: "Inspection", scans: RecordedSequence, asked: _Asked, show: Progress
+) -> Judge:
+    """What judges: a given reference, or an estimated one.
+
+    Where scans show that the recording's own is wrong, and nobody named it, it does not judge.
+    """
+    length, called, doubt = asked.length, found.config().reference or "its own poses", ""
+    if not wants_estimate(found.config()) and (trajectory := scans.reference()) is not None:
+        doubt = _doubt(scans, trajectory, asked, show)
+        if doubt and asked.reference is None:
+            found.given["reference"] = ESTIMATED
+    sequences = StudySequences({name: found.config()}, {}, asked.out)
+    if wants_estimate(found.config()):
+        ensure_references(sequences, [name], length or 5.0, show)
+        trajectory = read_trajectory(sequences.estimate_path(name))
+        called = "an estimated reference" + f", as {called} {doubt}" * bool(doubt)
+        doubt = ""
+    assert trajectory is not None
+    stored = sequences.estimate(name)
+    length = length or proposed_sub_trajectory(trajectory, training=0.0)
+    error = math.nan if stored is None else stored.error(length)
+    own = None if math.isnan(error) else error
+    reference = Reference(trajectory, length, stored is not None, own)
+    begin, end = scans.source.span() or trajectory.stamps[[0, -1]].tolist()
+    unknown = stored.unknown if stored else ()
+    return Judge(name, reference, called, begin, end, unknown, doubt)
+
+
+def _doubt(scans: RecordedSequence, trajectory: Trajectory, asked: _Asked, show: Progress) -> str:
+    """What scans say against a given reference, in words; empty if nothing."""
+    if asked.reference is None:  # as `tune` does; who names one insists on it
+        measured = measure_reference(scans, trajectory, partial(show, "registering"))
+        length = asked.length or proposed_sub_trajectory(trajectory, training=0.0)
+        if (error := measured.error(length)) is not None:
+            return f"is wrong by {error.mean:.2g} %" if measured.is_noisy(length) else ""
+    cause = contradiction(scans, trajectory)
+    return "" if cause is None else f"contradicts the scans ({cause})"
+
+
+def _pairs(judged: Sequence[Judged]) -> list[Compared]:
+    """The best trajectory against each other one, on the recordings that have both."""
+    by: dict[str, dict[str, Judged]] = {}
+    for one in judged:
+        by.setdefault(one.name, {})[one.judge.recording] = one
+    means = {name: float(np.mean([one.rte for one in of.values()])) for name, of in by.items()}
+    best, *others = sorted(means, key=lambda name: means[name])
+    found = []
+    for other in others:
+        both = [pair_of(by[best][r], by[other][r]) for r in by[best]]
+        if known := [pair for pair in both if pair.errors.size]:
+            found.append(Compared(best, other, ratio(known)))
+    return found

@@ -1,0 +1,83 @@
+"""Trajectories that a user names: files, topics, topics of other bags, and arrays."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses
+from adaptune.recording.bag import UNOPENED, BagSource
+from adaptune.recording.config import BAG_SUFFIXES, bag_paths
+from adaptune.recording.recording import RecordedSequence
+from adaptune.trajectory import Trajectory
+
+Named = str | Path | Trajectory | tuple[Any, Any]
+"""A file, a topic, a topic of another bag as ``run2.bag:/odom``, a chain of transforms as
+``/tf:map.base_link``; or a trajectory; or stamps, of shape (n,), in integer nanoseconds or seconds,
+and poses of shape (n, 4, 4)."""
+
+
+class Convention(NamedTuple):
+    """How the poses of trajectories are given."""
+
+    T_body_sensor: Poses | None = None  # the LiDAR's pose in their frame
+    clock_offset: float = 0.0  # seconds to add to their stamps
+    pose_time: Literal["stamp", "end"] = "stamp"  # the moment of a scan that they are of
+
+
+def parted(words: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """Which words are recordings, and which trajectories; the first is a recording."""
+    bags = [w for i, w in enumerate(words) if not i or Path(w).suffix in BAG_SUFFIXES]
+    bags += [w for w in words if w not in bags and Path(w).is_dir()]
+    return [Path(w) for w in words if w in bags], [w for w in words if w not in bags]
+
+
+def name_of(given: Named, number: int = 1) -> str:
+    """What a trajectory is called."""
+    if not isinstance(given, str | Path):
+        return f"trajectory {number}"
+    return Path(given).name if Path(given).is_file() else str(given)
+
+
+def read(given: Named, scans: RecordedSequence, by: Convention, span: int) -> Trajectory:
+    """Read a trajectory as poses of the LiDAR, at the stamps of scans of `span` nanoseconds.
+
+    An AdaptuneError says why it is none of this recording.
+    """
+    found = _poses(given, scans)
+    T, later = found.T_world_sensor, round(1e9 * by.clock_offset) + span * (by.pose_time == "end")
+    T = T if by.T_body_sensor is None else T @ by.T_body_sensor
+    found = Trajectory(found.stamps + later, T, found.max_gap)
+    scans.check_time(found, name_of(given))
+    return found
+
+
+def _poses(given: Named, scans: RecordedSequence) -> Trajectory:
+    if isinstance(given, Trajectory):
+        return given
+    if not isinstance(given, str | Path):
+        try:
+            stamps, T = np.asarray(given[0]), np.asarray(given[1], np.float64)
+            stamps = np.round(1e9 * stamps) if stamps.dtype.kind == "f" else stamps
+            return Trajectory(stamps.astype(np.int64), T)
+        except (ValueError, IndexError, TypeError) as error:
+            what = "give stamps of shape (n,), and poses of shape (n, 4, 4)"
+            raise AdaptuneError(f"trajectory: {error}; {what}") from error
+    if Path(given).is_file():
+        return scans.from_file(Path(given))
+    bag, _, topic = ("", "", given) if str(given)[0] == "/" else str(given).partition(":/")
+    if not topic:
+        what = "there is no such file; topics begin with /, those of other bags as run2.bag:/odom"
+        raise AdaptuneError(f"{given}: {what}")
+    source: Any = BagSource(bag_paths([bag]), about=UNOPENED) if bag else scans.source
+    if not isinstance(source, BagSource):
+        raise AdaptuneError(f"{source.name}: has no topics; give a file of poses")
+    if bag:
+        with source.open() as reader:
+            source.topics = {c.topic: c.msgtype for c in reader.connections}
+    name, _, frames = str(topic).lstrip("/").partition(":")
+    found = source.poses(f"/{name}", frames or None, strict=True)
+    assert found is not None  # the topic is named
+    return found

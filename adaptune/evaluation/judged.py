@@ -1,0 +1,200 @@
+"""A trajectory as a reference judges it: how wrong it is, where, and how surely."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.errors import AdaptuneError, Finding
+from adaptune.geometry import Poses
+from adaptune.metrics import LOST_ABOVE, span, travelled
+from adaptune.paired import ERROR_FACTOR, Interval, Pair, interval_of_mean
+from adaptune.recording.poses import sound
+from adaptune.reference.carried import stands
+from adaptune.reference.check import FEWEST, LONGER
+from adaptune.reference.judge import Reference
+from adaptune.trajectory import Trajectory
+
+_PAUSE = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
+
+
+class Judge(NamedTuple):
+    """What judges the trajectories of a recording."""
+
+    recording: str
+    reference: Reference  # it has poses
+    name: str  # in words
+    begin: int  # nanoseconds of the first scan, and about those of the last
+    end: int
+    unknown: Sequence[tuple[float, float, str]] = ()  # from when to when, in seconds, and why
+    doubt: str = ""  # what the scans say against it
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Its poses."""
+        assert self.reference.trajectory is not None
+        return self.reference.trajectory
+
+    def stamps(self, *others: Trajectory) -> NDArray[np.int64]:
+        """Where trajectories are judged: at the poses of the one that has the fewest, (n,).
+
+        All others go straight between theirs. In each gap of the judge lies one more, where nothing
+        is known: no sub-trajectory crosses it.
+        """
+        mine = self.trajectory.stamps
+        begin, end = (side([mine, *(o.stamps for o in others)]) for side in (_latest, _earliest))
+        every = [s[(s >= begin) & (s <= end)] for s in (mine, *(o.stamps for o in others))]
+        gaps = np.flatnonzero(np.diff(mine) > self.trajectory.max_gap * 1e9)
+        middle = (mine[gaps] // 2 + mine[gaps + 1] // 2)[: len(every[0])]
+        stamps = np.union1d(min(every, key=len), middle[(middle > begin) & (middle < end)])
+        known = [np.isfinite(other.at(stamps)[:, 0, 0]) for other in others]
+        return np.asarray(stamps[np.all(known, axis=0) | np.isin(stamps, middle)])
+
+
+def _latest(stamps: Sequence[NDArray[np.int64]]) -> int:
+    return max(int(one[0]) for one in stamps)
+
+
+def _earliest(stamps: Sequence[NDArray[np.int64]]) -> int:
+    return min(int(one[-1]) for one in stamps)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A trajectory of the LiDAR's poses, judged at stamps of shape (n,)."""
+
+    name: str
+    judge: Judge
+    trajectory: Trajectory
+    stamps: NDArray[np.int64]
+    cause: Finding | None = None  # what its poses are, if not the LiDAR's at the stamps
+
+    @property
+    def title(self) -> str:
+        """What it is of, in words."""
+        return f"{self.name} on {self.judge.recording}"
+
+    @cached_property
+    def odometry(self) -> Trajectory:
+        """Its poses at the stamps."""
+        return Trajectory(self.stamps, np.nan_to_num(self.trajectory.at(self.stamps, 1e9)))
+
+    @cached_property
+    def truth(self) -> Poses:
+        """The judge's poses there, of shape (n, 4, 4); NaN where they are unknown."""
+        return self.judge.trajectory.at(self.stamps)
+
+    @cached_property
+    def seconds(self) -> NDArray[np.float64]:
+        """From the first scan on, of shape (n,)."""
+        return np.asarray((self.stamps - self.judge.begin) * 1e-9)
+
+    @cached_property
+    def errors(self) -> NDArray[np.float64]:
+        """Capped RTE in percent of the sub-trajectory from each pose, of shape (n,), or NaN."""
+        return self.judge.reference.errors(self.odometry)
+
+    @cached_property
+    def around(self) -> NDArray[np.float64]:
+        """Mean RTE in percent of the sub-trajectories through each pose, of shape (n,), or NaN."""
+        return self.judge.reference.errors_around(self.odometry)
+
+    @cached_property
+    def rte(self) -> float:
+        """Mean error in percent."""
+        if np.isfinite(self.errors).any():
+            return float(np.nanmean(self.errors))
+        metres = self.judge.reference.length
+        what = f"no {metres:g} m of it can be judged; name a longer one, or a smaller length"
+        raise AdaptuneError(f"{self.title}: {what} (sub_trajectory)")
+
+    @cached_property
+    def interval(self) -> Interval:
+        """95 % interval of the mean error, with the judge's own error as far as it is known."""
+        known = self.errors[np.isfinite(self.errors)]
+        block = span(self.truth, self.judge.reference.length)
+        return interval_of_mean(known, block, self.judge.reference.error)
+
+    @property
+    def blind(self) -> bool:
+        """Whether the judge is about as wrong as what it judges."""
+        low = self.interval[0] if self.interval else math.inf
+        return low == 0.0 or self.rte < ERROR_FACTOR * (self.judge.reference.error or 0.0)
+
+    @cached_property
+    def drift(self) -> tuple[float, float]:
+        """Metres of error in a hundred, and over how many metres that was measured."""
+        reference, metres = self.judge.reference, float(travelled(self.truth)[-1])
+        for length in (m for m in LONGER[::-1] if FEWEST * m <= metres and m > reference.length):
+            errors = reference._replace(length=length).errors(self.odometry)
+            if np.isfinite(errors).any():
+                return float(np.nanmean(errors)), length
+        return self.rte, reference.length
+
+    @cached_property
+    def unknown_share(self) -> float:
+        """Share of its time in which the judge knows no pose."""
+        begin, end = max(int(self.trajectory.stamps[0]), self.judge.begin), int(self.stamps[-1])
+        judge = self.judge.trajectory
+        steps = np.diff([begin, *judge.stamps[(judge.stamps > begin) & (judge.stamps < end)], end])
+        return float(steps[steps > judge.max_gap * 1e9].sum() / max(end - begin, 1))
+
+    @cached_property
+    def faults(self) -> list[Finding]:
+        """Where it jumps, stands still while the robot moves, or gives nothing."""
+        judge, stamps = self.judge, self.trajectory.stamps
+        found = [f._replace(mend="") for f in sound(self.trajectory, judge.begin, name="it")[1]]
+        if found and found[-1].seconds is None:
+            to_and_fro = found.pop()
+            if self.cause is None and self.rte > LOST_ABOVE:
+                what = f"{to_and_fro.what}; if two nodes publish it by turns, record one of them"
+                raise AdaptuneError(f"{self.title}: {what}")
+        still = stands(self.truth, self.odometry.T_world_sensor)
+        edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
+        what = "it stands still while the robot moves"
+        spans = [(what, *self.seconds[edge - (0, 1)]) for edge in edges]
+        ends = (np.array([min(judge.begin, stamps[0]), *stamps, judge.end]) - judge.begin) * 1e-9
+        usual = max(1.0, _PAUSE * float(np.median(np.diff(ends))))
+        long = np.flatnonzero(np.diff(ends) > usual)
+        spans += [("it gives nothing", *ends[i : i + 2]) for i in long]
+        return found + [Finding((), what, seconds=(float(a), float(b))) for what, a, b in spans]
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The row of a table; columns that begin with an underscore are for files only."""
+        (low, high), reference = self.interval or (None, None), self.judge.reference
+        worst, (drift, over) = int(np.nanargmax(self.around)), self.drift
+        return {
+            "recording": self.judge.recording,
+            "trajectory": self.name,
+            "RTE [%]": self.rte,
+            "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
+            "drift [m/100 m]": drift,
+            "worst [%]": float(self.around[worst]),
+            "at [s]": float(self.seconds[worst]),
+            "x [m]": float(self.truth[worst, 0, 3]),
+            "y [m]": float(self.truth[worst, 1, 3]),
+            "unknown [%]": 100.0 * self.unknown_share,
+            "faults": len(self.faults),
+            "_low": low,
+            "_high": high,
+            "_length_m": reference.length,
+            "_drift_over_m": over,
+            "_judge": self.judge.name,
+            "_judge_error_percent": reference.error,
+            "_findings": "; ".join(map(str, [*([self.cause] if self.cause else []), *self.faults])),
+        }
+
+
+def pair_of(one: Judged, other: Judged) -> Pair:
+    """Two trajectories of a recording, at stamps that both have."""
+    judge = one.judge
+    stamps = judge.stamps(one.trajectory, other.trajectory)
+    errors = np.stack([Judged(j.name, judge, j.trajectory, stamps).errors for j in (one, other)])
+    block = span(judge.trajectory.at(stamps), judge.reference.length)
+    known = errors[:, np.isfinite(errors).all(axis=0)]
+    return Pair(known, block, judge.recording, judge.reference.error)
