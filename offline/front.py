@@ -125,13 +125,6 @@ def left_out(
     return ""
 
 
-def elsewhere_in_words(rows: Sequence[dict[str, Any]]) -> str:
-    """What to expect of the fixed set on another drive."""
-    row = next(row for row in rows if FIXED in row["what"])
-    ratio, ends = f"{row['vs baseline']:.2f} times", f"{row['low']:.2f} to {row['high']:.2f}"
-    return f"On another drive, expect {ratio} the baseline's error (95 % interval {ends})."
-
-
 SECONDS = 60.0
 """Of a recording, on which costs are measured."""
 

@@ -44,7 +44,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import ANY, COST, EQUAL, FILES, elsewhere_in_words, front_rows, left_out
+from offline.front import ANY, COST, EQUAL, FILES, front_rows, left_out
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -75,26 +75,14 @@ class Training(NamedTuple):
 
     @property
     def words(self) -> list[str]:
-        """What the fixed set is, and what it gains in training."""
-        sets, fixed, n = self.model.sets, self.model.fixed, len(self.rows)
+        """What must be known of the trials, and the parameters of fixed set and baseline."""
+        sets, fixed = self.model.sets, self.model.fixed
         said = [*self.said, *self.failed]
-        own, of_fixed = (
-            sum(row[f"{mode}, whole"] for row in self.rows) / n for mode in ("baseline", "fixed")
-        )
-        costs, where = self.model.costs, f"in training ({n} sequence{'s' if n > 1 else ''})"
-        own_ms, ms = (np.nan if costs is None else costs.alone(trial) for trial in (0, fixed))
-        baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
-        if fixed == 0:
-            least = f"No set within the budget is safely better than the baseline's {own:.3f} %"
-            return [*said, f"{least} {where}; the fixed set is the baseline.", baseline]
-        return [
-            *said,
-            f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}, at {ms:.1f} "
-            f"instead of {own_ms:.1f} ms of CPU time a scan.",
-            elsewhere_in_words(self.front),
-            f"Parameters of the fixed set: {in_words(sets[fixed])}",
-            baseline,
-        ]
+        if fixed:
+            said.append(f"Parameters of the fixed set: {in_words(sets[fixed])}")
+        else:
+            said.append("No set within the budget is safely better than the baseline in training.")
+        return [*said, f"Parameters of the baseline: {in_words(sets.space.baseline)}"]
 
 
 def train(

@@ -105,8 +105,6 @@ class Gate(NamedTuple):
     verdict: Verdict
     rows: list[GateRow]
     words: str  # in one line
-    odometry: str  # the new side's
-    mode: str  # in which both were driven
 
 
 def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
@@ -285,8 +283,7 @@ def compare_sides(
     rows += [_restarts(pairs, share), *_lacking(pairs)]
     verdict = _overall(rows)
     left_out = f" Not compared: {shared.alone}." if shared.alone else ""
-    words = _in_words(shared, verdict, rows) + left_out
-    return Gate(verdict, rows, words, shared.new.study.odometry.name, shared.mode)
+    return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out)
 
 
 def _rows(
@@ -392,15 +389,15 @@ def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
     return f"{first}: {shared.new.name} against {shared.old.name}, {of}: {'; '.join(parts)}.{where}"
 
 
-def write_gate(folder: Path, gate: Gate) -> None:
+def write_gate(folder: Path, gate: Gate, shared: Shared) -> None:
     """Write ``verdict.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
     # Of the error over all, which comes last.
     error = [row for row in gate.rows if row.quantity == ERROR][-1]
     data = {
         "action": gate.verdict if gate.verdict in ("worse", "unclear") else "pass",
         "verdict": gate.verdict,
-        "odometry": gate.odometry,
-        "mode": gate.mode,
+        "odometry": shared.new.study.odometry.name,
+        "mode": shared.mode,
         "ratio": error.ratio,
         "interval": [error.low, error.high],
         "why": [gate.words],

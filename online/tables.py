@@ -22,25 +22,6 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     return [*made, *_standard(rows)]
 
 
-def front_table(front: Sequence[Mapping[str, Any]], title: str, how: str) -> Listing:
-    """What may be driven, see `online.verdict.choices`: errors, costs, and `how` to drive it."""
-    cells = []
-    for row in front:
-        trial, of = row["trial"], f" ({row['odometry']})" if row["odometry"] else ""
-        what = "-> " * row["recommended"] + row["what"]
-        what += f": trial {trial}" * bool(trial) + of + "*" * (row["driven on"] != "test")
-        low, high, file, own = row["low"], row["high"], row["file"], row["what"] == "own parameters"
-        ends = None if low is None else "1" if low == high else f"{low:.2f}-{high:.2f}"
-        use = f"{'load' if file.endswith('.yaml') else 'run'} {file}" if file else None
-        use = "change nothing" if own else use
-        made = {"choice": what, "RTE [%]": row["error [%]"], "another drive": ends}
-        made |= {"cost [ms]": row["cost [ms]"], "to drive it": use}
-        cells.append(made | {"parameters": row["parameters"]})
-    training = " * Error and cost are of training: it was not driven on the test."
-    said = "Another drive: the error there, in times that of the odometry's own parameters, 95 %."
-    return Listing(title, cells, said + training * any("*" in row["choice"] for row in cells) + how)
-
-
 def controls(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     """All modes with their errors, ratios and costs, where there are others than on the front."""
     if {row.mode for row in rows} <= {"baseline", "fixed", "adaptive", "untrained", ORACLE}:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from adaptune.commands.terminal import (
-    BUYS,
     Cluster,
     Folder,
     Override,
@@ -18,7 +17,6 @@ from adaptune.commands.terminal import (
     load,
     progress,
     say,
-    say_fixed,
     say_next,
     say_next_of_study,
     say_next_of_trained,
@@ -93,8 +91,7 @@ def offline(
     for sentence in training.words:
         say(sentence)
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
-    say_fixed(loaded)
-    show_front(training.front, *BUYS)
+    show_front(loaded, training.front, "What each choice gives in training,")
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,
@@ -213,12 +210,8 @@ def cost(
     with progress() as show:
         rows = measured_front(loaded, scans, show)
     chosen = next(row for row in rows if row["recommended"])
-    say(f"Drive {chosen['what']}: {chosen['parameters']}.")
-    show_front(
-        rows,
-        f"What the front costs on {recording.name}, here",
-        "CPU time and the 99th percentile of the time a scan; errors are those of training.",
-    )
+    say(f"Drive trial {chosen['trial']}: {chosen['parameters']}.")
+    show_front(loaded, rows, f"What each choice costs on {recording.name}, here, and in training")
 
 
 def reference(

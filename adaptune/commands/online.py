@@ -24,6 +24,7 @@ from adaptune.commands.terminal import (
     say,
     say_next,
     say_next_of_study,
+    show_front,
     show_table,
 )
 from adaptune.errors import AdaptuneError
@@ -310,7 +311,7 @@ def _gate(
         shared = shared_replays(*both)
         measured = costs(shared, show) if cost < math.inf else None
     gate = compare_sides(shared, measured, error, cost)
-    write_gate(out, gate)
+    write_gate(out, gate, shared)
     say(gate.words)
     metres = both[0].study.config.sub_trajectory
     show_table(f"New against old, RTE over {metres:g} m", [row.columns() for row in gate.rows])
@@ -332,15 +333,12 @@ def say_compared(
     loaded: "OfflineStudy", found: "ComparedReplays", page: Path, *, details: bool = False
 ) -> None:
     """Print what to do and what may be driven; with `details`, all that is on the page."""
-    from adaptune.tuning.verdict import front_table
     from online.tables import controls, tables
 
     length = loaded.config.sub_trajectory
     say(" ".join(found.verdict))
     if found.front:
-        title, rows, caption = front_table(loaded, found)
-        few = [{key: row[key] for key in row if key != "parameters"} for row in rows]
-        show_table(title, few, caption)
+        show_front(loaded, found.front)
     say(f"More: {page}")
     for sentence in found.details if details else ():
         say(sentence)

@@ -59,31 +59,13 @@ def show_table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "")
     console.print(*tables_within(Listing(title, rows, caption), console.width), sep="\n")
 
 
-def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> None:
-    """The table of what CPU time buys."""
-    shown = [
-        {
-            "": "-> " * row["recommended"] + row["what"].split(", ")[0],
-            **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
-            "RTE [%]": row["error [%]"],
-            "elsewhere": row["vs baseline"],
-            "95 %": None
-            if row["low"] is None or row["low"] != row["low"]
-            else f"{row['low']:.2f}-{row['high']:.2f}",
-            "parameters": row["parameters"],
-        }
-        for row in rows
-    ]
-    show_table(title, shown, caption)
+def show_front(study: "OfflineStudy", rows: Sequence[Mapping[str, Any]], *title: str) -> None:
+    """The table of what may be driven, without the parameters, which are in files."""
+    from adaptune.tuning.verdict import front_table
 
-
-BUYS = (
-    "What CPU time buys, in training",
-    "The arrow marks what is recommended: the least bound of the error within the budget (twice "
-    "what the odometry's own parameters take, unless --budget says otherwise). RTE is of whole "
-    "drives, capped where track is lost; a bank's is of parts left out of training. Elsewhere: the "
-    "ratio to the baseline's to expect on another drive, and its 95 % interval.",
-)
+    title_, cells, caption = front_table(study, rows, *title)
+    few = [{key: cell[key] for key in cell if key != "parameters"} for cell in cells]
+    show_table(title_, few, caption)
 
 
 def begin_work() -> None:
@@ -98,18 +80,6 @@ def progress() -> Iterator[Progress]:
     begin_work()
     with bars(errors) as show:
         yield show
-
-
-def say_fixed(study: "OfflineStudy") -> None:
-    """Say where the fixed set is, and where it is as the odometry's own tool reads it."""
-    from adaptune.study.study import FIXED_SET
-
-    fixed = study.fixed
-    own = None if fixed is None else study.own_file(fixed)
-    there = own is not None and own[0].exists()
-    more = f"; for the odometry's own tool: {own[0]} ({own[1].use})" if own and there else ""
-    unchanged = ", all unchanged" * (fixed == study.odometry.space.baseline)
-    say(f"The parameters{unchanged}: {study.folder / FIXED_SET}{more}.")
 
 
 def say_next(why: str, *words: object, first: str = "") -> None:

@@ -10,7 +10,6 @@ import typer
 
 from adaptune.commands.online import Details, say_compared
 from adaptune.commands.terminal import (
-    BUYS,
     As,
     Cluster,
     Given,
@@ -21,7 +20,6 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next,
-    show_front,
     show_table,
 )
 from adaptune.errors import AdaptuneError
@@ -292,10 +290,8 @@ def tune(
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)
     for sentence in tuned.training.failed:
         say(sentence)
-    if details:
-        show_front(tuned.training.front, *BUYS)
-        if odometries := by_odometry(tuned.training.trials):
-            show_table(*odometries)
+    if details and (odometries := by_odometry(tuned.training.trials)):
+        show_table(*odometries)
     if tuned.more:
         _say_grown(tuned.more, tuned.before, tuned.fixed)
     _say_recordings(tuned)

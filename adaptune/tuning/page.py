@@ -45,7 +45,7 @@ def write_study_page(study: OfflineStudy, found: ComparedReplays | str) -> Path:
     )
     words = () if isinstance(found, str) else tuple(found.verdict)
     if not isinstance(found, str) and found.front:
-        sections.insert(0, PageSection("What to drive", tables=(front_table(study, found),)))
+        sections.insert(0, PageSection("What to drive", tables=(front_table(study, found.front),)))
     path = study.folder / "report" / "report.html"
     write_page(path, Page(study.name, subtitle, words, tuple(sections)))
     return path

@@ -1,6 +1,7 @@
 """The verdict of a study: the table of what may be driven, and a file for programs."""
 
 import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,27 +9,45 @@ import numpy as np
 from adaptune.archive import Archive
 from adaptune.files import write_text
 from adaptune.manifest import plain
+from adaptune.model.registry import ADAPTIVE
 from adaptune.report.tables import Listing
 from offline.choice import USUAL_BUDGET
 from offline.config import OfflineStudy
 from offline.front import COST, OWN
-from online import tables
 from online.compare import ComparedReplays
 from online.modes import BASELINE
 
 FILE = "verdict.json"
 
 
-def front_table(study: OfflineStudy, found: ComparedReplays) -> Listing:
-    """What may be driven, and how."""
-    metres, folder = f"{study.config.sub_trajectory:g} m", study.folder
-    how = f" RTE: mean error of the parts of the path that are {metres} long. Files: {folder}"
+def front_table(
+    study: OfflineStudy, rows: Sequence[Mapping[str, Any]], title: str = "What each choice gives"
+) -> Listing:
+    """What may be driven, in training or on the test, and how: rows of a front, or `choices`."""
+    cells, metres = [], f"{study.config.sub_trajectory:g} m"
+    for row in rows:
+        what, *_ = row["what"].split(", ")
+        trial, of = row["trial"], f" ({row['odometry']})" if row["odometry"] else ""
+        name = "-> " * row["recommended"] + what + (f": trial {trial}" if trial else "") + of
+        low, high, file = row["low"], row["high"], row["file"]
+        use = f"{'load' if file.endswith('.yaml') else 'run'} {file}" if file else None
+        cell = {"choice": name + "*" * (row.get("driven on") == "training")}
+        cell |= {"RTE [%]": row["error [%]"]}
+        cell["another drive"] = low and ("1" if low == high else f"{low:.2f}-{high:.2f}")
+        cell |= {key: row[key] for key in (COST, "99 % [ms]", "memory [MB]") if key in row}
+        cell["to drive it"] = "change nothing" if what == OWN else use
+        cells.append(cell | {"parameters": row["parameters"]})
+    said = [
+        "Another drive: the error there, in times that of the odometry's own parameters, 95 %.",
+        "* Error and cost are of training." * any("*" in cell["choice"] for cell in cells),
+        f"RTE: mean error of the parts of the path that are {metres} long. Files: {study.folder}.",
+    ]
     own = None if study.fixed is None else study.own_file(study.fixed)
     if own is not None and own[0].exists():
-        how += f"; fixed.yaml for the odometry's own tool: {own[0].name} ({own[1].use})"
-    if any(row["mode"] == "adaptive" for row in found.front):
-        how += f". Adaptive, on a robot: `adaptune online {folder} --ros2 --mode adaptive`"
-    return tables.front_table(found.front, f"What each choice gives over {metres}", f"{how}.")
+        said.append(f"For the odometry's own tool: {own[0].name} ({own[1].use}).")
+    if any(row["what"] == ADAPTIVE for row in rows):
+        said.append(f"On a robot: `adaptune online {study.folder} --ros2 --mode adaptive`.")
+    return Listing(f"{title} over {metres}", cells, " ".join(filter(None, said)))
 
 
 def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:

@@ -140,9 +140,9 @@ def test_a_set_that_is_surely_worse_on_one_recording_is_not_chosen():
 def test_the_front_has_a_set_for_each_budget():
     errors = noisy([1.0, 0.8, 0.6, 0.9, 0.5, 3.0, 0.4])
     found = blocks(errors, [10, 10.9, 17, 5, 21, 1, 40])
-    assert front(found, None) == (0, 1, 4, 2, 6)
-    assert front(found, 18.0) == (0, 1, 2, 2, 6)
-    assert front(found._replace(period=60.0), None).best == 4  # the dearest may come too late
+    assert front(found, None) == (0, 4, 1, 6, 2)
+    assert front(found, 18.0) == (0, 2, 1, 6, 2)
+    assert front(found._replace(period=60.0), None).any_cost == 4  # the dearest may come too late
     assert {0, 1, 2, 4, 6} <= set(finalists(found))
     assert affordable(found, None).tolist() == [True, True, True, True, True, True, False]
 

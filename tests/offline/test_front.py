@@ -11,7 +11,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.model.rules import Costs, SetCost
 from offline.choice import BlockErrors
 from offline.config import load_study
-from offline.front import COST, OWN, elsewhere_in_words, left_out, measured_front, recommended
+from offline.front import COST, OWN, left_out, measured_front, recommended
 
 
 @pytest.fixture
@@ -28,8 +28,6 @@ def test_the_front_rises_in_cost_and_marks_what_is_recommended(study):
     assert (base["trial"], base["vs baseline"]) == (0, 1.0)
     for row in rows:
         assert row["low"] <= row["vs baseline"] <= row["high"]
-    ends = f"{chosen['low']:.2f} to {chosen['high']:.2f}"
-    assert chosen["trial"] is None or ends in elsewhere_in_words(rows)
 
 
 def test_the_front_is_measured_on_another_recording(study):

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 from adaptune.paired import Ratio
 from online.statistics import ALL, ORACLE, ComparisonRow
-from online.tables import front_table
 from online.verdict import choices, decided, late, remarks, verdict
 
 
@@ -91,26 +90,6 @@ def test_what_may_be_driven_by_cost():
     assert [row["mode"] for row in alone] == ["baseline", "fixed", "adaptive"]
     assert [row["recommended"] for row in alone] == [False, True, False]
     assert not any(row["recommended"] for row in choices(rows, front(), "none"))
-    table = front_table(found, "title", " How.")
-    assert [row["choice"] for row in table.rows] == [
-        "own parameters",
-        "no more CPU time: trial 3*",
-        "-> within the budget: trial 7",
-        "any CPU time: trial 9*",
-        "adaptive",
-    ]
-    assert [row["to drive it"] for row in table.rows] == [
-        "change nothing",
-        "load 3.yaml",
-        "load fixed.yaml",
-        "load 9.yaml",
-        "run model.safetensors",
-    ]
-    assert table.rows[1]["another drive"] == "0.30-0.80"
-    assert table.caption.endswith(
-        "* Error and cost are of training: it was not driven on the test. How."
-    )
-    assert "*" not in front_table(alone, "title", "").caption
 
 
 def test_adapting_is_advised_where_training_recommends_it():

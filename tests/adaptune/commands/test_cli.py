@@ -57,13 +57,11 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
         assert words[1:] == ["one.yaml", "--folder", "my study[v2]", *overrides]
         lines = [line for line in done.stdout.splitlines() if line.strip()]
         assert len(set(lines)) == len(lines)
-        there = ": my study[v2]/fixed.yaml." in done.stdout
-        assert (command == "offline") == there
+        assert (command != "online") == ("Files: my study[v2]." in " ".join(done.stdout.split()))
         assert (command == "online") == ("4 replays made: my study[v2]/replays/" in done.stdout)
-        trained = "% in training (1 sequence)"
+        trained = "What each choice gives in training, over "
         assert (command == "offline") == (trained in done.stdout)
     assert done.stdout.startswith(("Drive ", "Keep "))
-    assert "Files: my study[v2]" in done.stdout
     words = "baseline", "fixed", "adaptive", "paper", "one_60-100"
     assert all(word in done.stdout for word in words)
     table = done.stdout[done.stdout.rindex("RTE over") : done.stdout.index("Next: ")]

@@ -60,7 +60,7 @@ def test_one_command_tunes_compares_and_resumes(bag, tmp_path):
     begin = next(i for i, line in enumerate(lines) if line.startswith(("Drive", "Keep")))
     assert (folder / "report/report.html").exists()
     assert lines[begin + 1].startswith("What each choice gives over ")
-    assert f"Files: runs/{folder.name}" in " ".join(lines)
+    assert f"Files: runs/{folder.name}." in " ".join(done.stdout.split())
     assert (folder / "verdict.json").exists()
     (more,) = (line for line in lines if line.startswith("More: "))
     assert more.startswith("More: runs/")

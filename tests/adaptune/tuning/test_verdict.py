@@ -73,10 +73,24 @@ def test_where_nothing_is_advised_the_action_says_so(study, found):
     assert written(study, found._replace(front=[], advised=""))["action"] == "unknown"
 
 
-def test_the_table_says_where_files_are_and_how_to_adapt(study, found):
-    table = front_table(study, found)
-    assert f"Files: {study.folder}" in table.caption
+def test_the_table_says_what_each_choice_gives_and_how_to_drive_it(study, found):
+    table = front_table(study, found.front)
+    assert f"Files: {study.folder}." in table.caption
     assert f"`adaptune online {study.folder} --ros2 --mode adaptive`" in table.caption
-    (advised,) = (row for row in table.rows if row["choice"].startswith("-> "))
-    # Each choice has what to do.
-    assert all(row["to drive it"] for row in table.rows), advised
+    assert "*" not in table.caption.replace("`", "")
+    row = found.front[0] | {"what": "any CPU time", "trial": 9, "file": "any_cost.yaml"}
+    row |= {"low": 0.3, "high": 0.8, "recommended": False, "driven on": "training"}
+    own = row | {"what": "own parameters, any CPU time", "trial": 0, "low": 1.0, "high": 1.0}
+    bank = row | {"what": "adaptive", "trial": None, "file": "model.safetensors", "low": None}
+    few = [own, row | {"odometry": "ndt"}, bank | {"recommended": True, "driven on": "test"}]
+    table = front_table(study, few, "Here")
+    assert table.title.startswith("Here over ")
+    assert "* Error and cost are of training." in table.caption
+    shown = ("choice", "another drive", "to drive it")
+    assert [[row[key] for key in shown] for row in table.rows] == [
+        ["own parameters*", "1", "change nothing"],
+        ["any CPU time: trial 9 (ndt)*", "0.30-0.80", "load any_cost.yaml"],
+        ["-> adaptive", None, "run model.safetensors"],
+    ]
+    more = front_table(study, [row | {"99 % [ms]": 9.0, "memory [MB]": 5.0}]).rows[0]
+    assert (more["99 % [ms]"], more["memory [MB]"]) == (9.0, 5.0)
