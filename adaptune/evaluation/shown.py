@@ -9,6 +9,7 @@ import numpy as np
 from adaptune.evaluation.judged import Judged
 from adaptune.geometry import nearest_rotation
 from adaptune.paired import Ratio
+from adaptune.reference.diagnosis import OWN_ERROR
 from adaptune.reference.judge import columns_of
 from adaptune.report.charts import Axis, Chart, Line, Panel, Points
 from adaptune.report.page import Page, PageSection, write_page
@@ -39,7 +40,8 @@ def in_words(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[str]:
     """What to do, how wrong the trajectories are, and how surely, in five sentences at most."""
     doubts = (f"{one.judge.name} {one.judge.doubt}." for one in judged if one.judge.doubt)
     said = list(dict.fromkeys(doubts))
-    said += [f"{one.title}: {one.cause}." for one in judged if one.cause is not None][:_SAID]
+    causes = [(f"{one.title}: {one.cause}.", one.cause) for one in judged if one.cause]
+    said += [text for text, cause in causes if cause.mend != OWN_ERROR][:_SAID]
     main = next(one for one in judged if not pairs or one.name == pairs[0].better)
     said.append(("Best: " if pairs else "Worst: " if judged[1:] else "") + _error(main))
     for pair in pairs[:_SAID]:
@@ -59,7 +61,7 @@ def in_words(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[str]:
         why = "; ".join(f"{begin:.1f} to {end:.1f} s, {why}" for begin, end, why in gaps)
         share = f"{100.0 * unknown.unknown_share:.0f} % of {unknown.title}"
         said.append(f"Nobody can judge {share}" + f" ({why})" * bool(why) + ".")
-    return said[:_SENTENCES]
+    return [*said, *(text for text, cause in causes if cause.mend == OWN_ERROR)][:_SENTENCES]
 
 
 def _error(one: Judged) -> str:

@@ -135,6 +135,9 @@ def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Findin
 UNEXPLAINED = ", which none of the known causes explains"
 
 
+OWN_ERROR = "that is its own error, and no option mends it"
+
+
 class Mends(NamedTuple):
     """What mends poses, as who gives them is told; braces stand for the value that was found."""
 
@@ -157,7 +160,7 @@ _OF_ODOMETRY = Mends(
 _OPTIONS = Mends(
     clock="add {:.3f} to `--clock-offset`",
     place='give `--extrinsic "{}"`, the LiDAR\'s pose in their frame',
-    own="that is its own error, and no option mends it",
+    own=OWN_ERROR,
     rare="write more poses a second",
     unturned="write the orientations, too",
     ends="if they are of scans' ends, give `--pose-time end`",

@@ -1,0 +1,188 @@
+import json
+
+import estimates
+import numpy as np
+import pytest
+
+import adaptune
+from adaptune.errors import AdaptuneError
+from adaptune.evaluation import shown
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.recording import open_sequence
+from adaptune.trajectory import Trajectory, write_tum
+
+
+@pytest.fixture(autouse=True)
+def pageless(monkeypatch):
+    monkeypatch.setattr(shown, "write_page", lambda *_: None)
+
+
+@pytest.fixture
+def bag(study_file):
+    return study_file.parent / "one.bag"
+
+
+@pytest.fixture
+def truth(bag):
+    config = SequenceConfig(bag=str(bag), reference="/truth")
+    return open_sequence(config).reference()
+
+
+def longer(truth, factor, noise=0.0):
+    """The poses of an odometry that goes too far, with some noise."""
+    T = truth.T_world_sensor.copy()
+    T[:, :3, 3] *= factor
+    T[:, :3, 3] += np.random.default_rng(0).normal(0.0, noise, (len(T), 3))
+    return Trajectory(truth.stamps, T)
+
+
+def evaluated(bag, *trajectories, **options):
+    options = {"out": bag.parent / "out", "progress": lambda *_: None} | options
+    return adaptune.evaluate(bag, *trajectories, **options)
+
+
+def test_a_trajectory_is_judged_by_the_reference_that_is_named(bag, truth, tmp_path):
+    options = {"out": tmp_path, "sub_trajectory": 1.5}
+    found = evaluated(bag, longer(truth, 1.02), reference="/truth", **options)
+    (one,) = found.judged
+    # Each sub-trajectory is a step longer than 1.5 m.
+    assert one.rte == pytest.approx(2.0 * 1.8 / 1.5, abs=0.03)
+    low, high = one.interval
+    assert low <= one.rte <= high
+    assert found.words[0].startswith("trajectory 1 on one is wrong by 2.3")
+    assert "by /truth, whose own error is not known." in found.words[0]
+    assert len(found.words) <= 5
+    (row,) = json.loads((tmp_path / "evaluation.json").read_text())
+    assert row["RTE [%]"] == found.rows[0]["RTE [%]"] == pytest.approx(one.rte)
+    assert row["judge"] == "/truth"
+    assert (tmp_path / "evaluation.csv").read_text().startswith("recording,trajectory,RTE [%]")
+    assert [found.verdict(most) for most in (1.0, 2.4, 3.0)] == ["above", "unclear", "below"]
+
+
+def test_without_a_reference_one_is_estimated_once_and_its_error_counts(
+    bag, truth, tmp_path, monkeypatch
+):
+    estimator = estimates.install(monkeypatch)
+    write_tum(tmp_path / "mine.tum", longer(truth, 1.02))
+    options = {"reference": "estimated", "out": tmp_path, "sub_trajectory": 2.0}
+    found = evaluated(bag, tmp_path / "mine.tum", **options)
+    (one,) = found.judged
+    own = one.judge.reference.error
+    assert own == pytest.approx(0.3, abs=0.05)
+    assert "by an estimated reference, whose own error, about 0.3" in found.words[0]
+    by_truth = evaluated(bag, tmp_path / "mine.tum", **(options | {"reference": "/truth"})).judged[
+        0
+    ]
+    assert one.interval[1] - one.interval[0] > by_truth.interval[1] - by_truth.interval[0]
+    again = evaluated(bag, tmp_path / "mine.tum", **options)
+    assert again.words == found.words
+    assert estimator.names == ["one.bag"]
+    # What is as good as the judge, or better, is not told to have no error.
+    good = evaluated(bag, longer(truth, 1.0015), **options)
+    assert "is better than can be told here: below 0." in good.words[0]
+    assert good.verdict(0.01) == "unclear"
+
+
+def test_what_is_judged_is_not_its_own_judge(bag, monkeypatch):
+    estimates.install(monkeypatch)
+    (one,) = evaluated(bag, "/truth").judged
+    assert one.judge.name == "an estimated reference"
+    (one,) = evaluated(bag, longer(one.trajectory, 1.01)).judged
+    assert one.judge.name == "/truth"
+
+
+def test_which_of_several_is_better_or_that_nobody_can_tell(bag, truth):
+    made = [longer(truth, factor, 0.002) for factor in (1.03, 1.01, 1.0102)]
+    found = evaluated(bag, *made, reference="/truth", sub_trajectory=1.0)
+    assert found.judged[0].name == "trajectory 1"
+    assert [(pair.better, pair.other) for pair in found.pairs] == [
+        ("trajectory 2", "trajectory 3"),
+        ("trajectory 2", "trajectory 1"),
+    ]
+    near, far = (pair.ratio for pair in found.pairs)
+    assert near.interval[0] < near.value < 1.0 < near.interval[1] * 1.05
+    assert far.interval[1] < 0.5
+    text = " ".join(found.words)
+    assert found.words[0].startswith("Best: trajectory 2")
+    assert "It surely has 0.3" in text
+
+
+def test_bags_with_the_same_topic_are_rows_the_worst_first(study_file, tmp_path, monkeypatch):
+    estimates.install(monkeypatch)
+    bags = [study_file.parent / f"{name}.bag" for name in ("one", "two", "three")]
+    found = adaptune.evaluate(bags, "/truth", out=tmp_path, progress=lambda *_: None)
+    assert {one.judge.recording for one in found.judged} == {"one", "two", "three"}
+    errors = [one.rte for one in found.judged]
+    assert errors == sorted(errors, reverse=True)
+    assert found.words[0].startswith("Worst: /truth on ")
+    assert found.pairs == []
+    with pytest.raises(AdaptuneError, match="is of one recording, and there are 3"):
+        adaptune.evaluate(bags, bags[0].with_suffix(".tum"), out=tmp_path)
+
+
+def test_faults_gaps_and_parts_are_told(bag, truth):
+    T = longer(truth, 1.0)
+    T.T_world_sensor[20:30] = T.T_world_sensor[20]  # it hangs
+    kept = np.r_[0:8, 24:40]
+    late = Trajectory(truth.stamps[kept], truth.T_world_sensor[kept], 5.0)
+    found = evaluated(bag, T, reference="/truth", sub_trajectory=1.0)
+    (one,) = found.judged
+    assert any("stands still while the robot moves" in fault.what for fault in one.faults)
+    (one,) = evaluated(bag, late, reference="/truth", sub_trajectory=1.0).judged
+    (fault,) = one.faults
+    assert str(fault) == "it gives nothing, from 0.7 to 2.4 s"
+    part = Trajectory(truth.stamps[:25], truth.T_world_sensor[:25])
+    found = evaluated(bag, part, reference="/truth", sub_trajectory=1.0)
+    assert "it gives nothing, from 2.4 to 3.9 s" in " ".join(found.words)
+
+
+def test_where_the_judge_knows_nothing_is_told(bag, truth, tmp_path, monkeypatch):
+    estimates.install(monkeypatch, untrusted=[14])
+    found = evaluated(bag, truth, reference="estimated", sub_trajectory=1.0, out=tmp_path)
+    (one,) = found.judged
+    assert one.unknown_share == pytest.approx(1.1 / 3.9, abs=0.03)
+    assert "Nobody can judge 28 % of trajectory 1 on one (1.4 to 2.5 s, " in " ".join(found.words)
+    # No sub-trajectory leads through.
+    crossing = (one.seconds > 1.05) & (one.seconds < 1.4)
+    assert np.isnan(one.errors[crossing]).all()
+
+
+def test_what_the_poses_are_comes_first(bag, truth):
+    place = np.eye(4)
+    place[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    wrong = Trajectory(truth.stamps, truth.T_world_sensor @ place)
+    found = evaluated(bag, wrong, reference="/truth")
+    assert "of other axes" in found.words[0]
+    mended = found.judged[0].cause.mend.split('"')[1]
+    numbers = [float(number) for number in mended.split(",")]
+    (one,) = evaluated(bag, wrong, reference="/truth", extrinsic=numbers).judged
+    assert one.cause is None
+    assert one.rte < 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "words"),
+    [
+        (["none.tum"], {}, "none.tum: there is no such file; topics begin with /"),
+        (["/none"], {}, "no topic /none; .*; it holds /points .*, /truth"),
+        (["/points"], {}, "/points is sensor_msgs/msg/PointCloud2, not poses"),
+        ([], {}, "name a trajectory"),
+        (["/truth"], {"pose_time": "middle"}, "pose_time: give stamp or end"),
+        (["/truth"], {"sub_trajectory": -1.0}, "give metres, more than 0"),
+        (["/truth"], {"sub_trajectory": 50.0}, "no 50 m of it can be judged"),
+        (["/truth"], {"extrinsic": [1.0, 2.0]}, "extrinsic: give numbers"),
+        (
+            ["/truth"],
+            {"clock_offset": 1e6},
+            "/truth covers 1701000000.1.*, the scans cover",
+        ),
+        ([(np.arange(3), np.eye(4))], {}, "trajectory: .*; give stamps of shape"),
+        (["EMPTY"], {}, "holds no pose"),
+    ],
+)
+def test_bad_input_is_told_in_a_sentence(bag, tmp_path, given, options, words):
+    (tmp_path / "empty.tum").touch()
+    given = [tmp_path / "empty.tum" if one == "EMPTY" else one for one in given]
+    with pytest.raises(AdaptuneError, match=words) as error:
+        evaluated(bag, *given, **({"reference": "/truth"} | options))
+    assert "\n" not in str(error.value)
