@@ -78,6 +78,22 @@ def test_a_session_without_logging_sees_what_is_logged(capsys, monkeypatch):
     assert "later" not in said
 
 
+def test_a_notebook_stores_no_bars(capsys, monkeypatch):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as the kernel does
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with bars_and_words() as show:
+        for i in range(9):
+            now[0] = 1.5 * i
+            show(f"brief {i}", 1, 2)
+            show("runs", i, 9)
+        logging.getLogger("offline.train").info("done")
+    said = capsys.readouterr().err
+    assert "\x1b" not in said
+    assert (said.count("runs:"), said.count("brief"), said.count("done")) == (2, 0, 1)
+
+
 def test_numbers_may_be_those_of_numpy():
     about = {"parameters": {"n": {"baseline": np.int64(3)}}}
     asked = Asked([Path("a.bag")], about=about, budget=np.float64(5.0))
