@@ -105,6 +105,7 @@ class Gate(NamedTuple):
     verdict: Verdict
     rows: list[GateRow]
     words: str  # in one line
+    length: float = np.nan  # metres over which errors are measured
 
 
 def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
@@ -283,7 +284,8 @@ def compare_sides(
     rows += [_restarts(pairs, share), *_lacking(pairs)]
     verdict = _overall(rows)
     left_out = f" Not compared: {shared.alone}." if shared.alone else ""
-    return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out)
+    length = shared.new.study.config.sub_trajectory
+    return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out, length)
 
 
 def _rows(

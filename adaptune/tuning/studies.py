@@ -175,16 +175,18 @@ def _decided(
     from adaptune.odometry.registry import declare
     from offline.config import load_study
 
+    about = {name: manifest.plain(given) for name, given in asked.about.items()}
     for name in odometries_of(asked.odometry, True):
-        declare(name, asked.about.get("settings", {}))  # a wrong one is known before all is read
+        # A wrong one is known before all is read.
+        declare(name, about.get(name, {}).get("settings", {}))
     named, test = recorded(asked, show)
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
-    if asked.config is not None and asked.about:
+    if asked.config is not None and about:
         raise AdaptuneError("config: give it in the object's settings, or name its class")
     if asked.config is not None and len(odometries) != 1:
         raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
     undo_motion([*named.values()], odometries)
-    entries: list[Any] = [{"name": name, **manifest.plain(asked.about)} for name in odometries]
+    entries: list[Any] = [{"name": n, **about.get(n, {})} for n in odometries]
     if asked.config is not None:
         entries[0]["settings"] = {"config": str(asked.config.resolve())}
     if asked.trials is None and asked.minutes is None:

@@ -11,7 +11,9 @@ from xml.etree import ElementTree as Xml
 import commands
 import drives
 import pytest
+from fake_odometry import Fake
 
+import adaptune
 from adaptune import manifest
 from adaptune.odometry.tracker import Tracker
 from online.gate import judged
@@ -61,6 +63,15 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     assert done.exit_code == 0, done.output
     rows = json.loads((bags / "out/gate.json").read_text())["rows"]
     assert {row["ratio"] for row in rows if row["quantity"] == "error"} == {1.0}
+
+
+@pytest.mark.services
+def test_in_python_sides_may_be_objects(bags):
+    good, bad = Fake(keyframe_interval=1.0), Fake(keyframe_interval=30.0)
+    gate = adaptune.compare(bad, good, ["drive_a.bag", Path("drive_b.bag")], cost=None)
+    assert gate.verdict == "worse"
+    assert "fake_odometry:Fake (max_correspondence_distance 4, keyframe_interval 30)" in gate.words
+    assert adaptune.compare(good, good, "drive_a.bag", cost=None).verdict == "equal"
 
 
 @pytest.mark.services
