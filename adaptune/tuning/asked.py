@@ -86,7 +86,7 @@ def check_no_study(path: Path) -> None:
 def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
     """The recordings by the names of their sequences, and the names of those for the test."""
     from adaptune.recording.config import NO_REFERENCE
-    from adaptune.recording.fleet import check_alike, recordings_at
+    from adaptune.recording.fleet import recordings_at
 
     for path in asked.recordings:
         check_no_study(path)
@@ -110,7 +110,6 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
             f"its own; write a study file, see docs/your-bag.md"
         )
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
-    check_alike(inspections)
     named: dict[str, Inspection] = {}
     for inspection in inspections:
         path = inspection.path

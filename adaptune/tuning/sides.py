@@ -50,7 +50,7 @@ def sides(
 
     called, now = [*map(_called, given)], time.time()
     studies = _driven(given, asked, show) if asked.recordings else _studies(called)
-    _drive(studies, show)
+    _drive(studies, called, show)
     if length is not None:
         over = {"sub_trajectory": length}
         studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
@@ -239,7 +239,7 @@ def _named(given: str) -> dict[str, Any]:
     return {"name": given}
 
 
-def _drive(studies: "Sequence[OfflineStudy]", show: Progress) -> None:
+def _drive(studies: "Sequence[OfflineStudy]", called: Sequence[str], show: Progress) -> None:
     """Make the replays of the baselines that are missing, of a study that is a file.
 
     Both sides take turns on each recording, so that both meet the same state of the machine.
@@ -247,10 +247,16 @@ def _drive(studies: "Sequence[OfflineStudy]", show: Progress) -> None:
     from online.modes import BASELINE, replay_modes, sequences_without_model
 
     due = [
-        (name, study)
-        for study in studies
+        (name, side, study)
+        for side, study in zip(called, studies, strict=True)
         if not list((study.folder / "replays").glob("*/fixed/replay.json"))
         for name in sequences_without_model(study.config)
     ]
-    for name, study in sorted(due, key=lambda one: one[0]):
-        replay_modes(study, [name], (BASELINE,), show)
+    for name, side, study in sorted(due, key=lambda one: one[0]):
+        # Of the same text, the second one would not be shown.
+        texts = {f"{name}, {BASELINE}": f"{name}, {side}"}
+
+        def shown(text: str, *how: Any, texts: dict[str, str] = texts) -> None:
+            show(texts.get(text, text), *how)
+
+        replay_modes(study, [name], (BASELINE,), shown)
