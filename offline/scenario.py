@@ -34,6 +34,8 @@ class Scenario(NamedTuple):
     end: NDArray[np.intp]  # (n,): last frame of its sub-trajectory
     stretch: NDArray[np.intp]  # (n,): number of its stretch
     fold: NDArray[np.intp]  # (n,): of a recording or, with few of them, of a stretch
+    time: NDArray[np.float64]  # (n,): seconds from the sequence's first scan
+    place: NDArray[np.float64]  # (n, 3): metres, by the reference
     features: NDArray[np.float32]  # (n, n_features): averaged descriptors
     # (n, n_sets): RTE in percent, infinite where the track was lost
     performances: NDArray[np.float32]
@@ -47,7 +49,8 @@ class Scenario(NamedTuple):
         errors = {
             f"rte_{n}": values for n, values in zip(self.sets, self.performances.T, strict=True)
         }
-        return {name: getattr(self, name) for name in _OF_FRAMES} | features | errors
+        where = {"time": self.time} | dict(zip("xyz", self.place.T, strict=True))
+        return {name: getattr(self, name) for name in _OF_FRAMES} | where | features | errors
 
     def fixed(self, frames: NDArray[np.bool_]) -> int:
         """Trial number of the fixed set by some frames, with their stretches as blocks."""
@@ -129,6 +132,8 @@ def scenario(study: OfflineStudy) -> Scenario:
         np.concatenate([s.ends for s in data.sequences]),
         data.stretches(),
         fold,
+        np.concatenate([s.seconds for s in data.sequences]),
+        np.concatenate([s.positions for s in data.sequences]),
         np.concatenate([s.descriptors for s in data.sequences]),
         data.errors(),
         dict(data.sequences[0].blocks),
@@ -176,6 +181,8 @@ def read_scenario(path: Path | str) -> Scenario:
             end,
             stretch,
             fold,
+            columns["time"].astype(float),
+            np.stack([columns[axis].astype(float) for axis in "xyz"], axis=1),
             features.astype(np.float32),
             errors.astype(np.float32),
             about["blocks"],

@@ -43,7 +43,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import COST, elsewhere_in_words, front_rows
+from offline.front import COST, FIXED, OWN, elsewhere_in_words, front_rows
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -86,11 +86,13 @@ class Training(NamedTuple):
         if fixed == 0:
             least = f"No set within the budget is safely better than the baseline's {own:.3f} %"
             return [*said, f"{least} {where}; the fixed set is the baseline.", baseline]
+        # It may be another odometry's baseline, with which ratios compare.
+        kept = any(OWN in row["what"] and FIXED in row["what"] for row in self.front)
         return [
             *said,
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}, at {ms:.1f} "
             f"instead of {own_ms:.1f} ms of CPU time a scan.",
-            elsewhere_in_words(self.front),
+            *[elsewhere_in_words(self.front)] * (not kept),
             f"Parameters of the fixed set: {in_words(sets[fixed])}",
             baseline,
         ]

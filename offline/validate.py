@@ -18,7 +18,7 @@ from adaptune.metrics import cap
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, asked, rule_class, selected
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
-from adaptune.paired import MIN_RECORDINGS, Pair, ratio
+from adaptune.paired import MIN_BLOCKS, MIN_RECORDINGS, Pair, in_cell, ratio
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
@@ -288,12 +288,14 @@ def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> lis
 
 def baseline_in_words(validation: Validation) -> str:
     """How the baseline compares; the study's own fixed set is another than those compared with."""
-    s = validation.summary("baseline")
+    s, parts = validation.summary("baseline"), f"{len(validation.recordings)} stretches"
+    if s["low"] == s["high"]:
+        return f"Without what is left out, the baseline is chosen each time, over {parts}."
     better = ": there the baseline is better" if s["high"] < 1.0 else ""
     return (
         f"The baseline has {s['geometric']:.2f} times the error of the sets that are chosen "
-        f"without what is left out, over {len(validation.recordings)} stretches (95 % interval "
-        f"{s['low']:.2f}-{s['high']:.2f}){better}."
+        f"without what is left out, over {parts} (95 % interval "
+        f"{in_cell((s['low'], s['high']))}){better}."
     )
 
 
@@ -312,13 +314,13 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         name: str,
         fixed: float | None,
         values: Mapping[str, float],
-        interval: tuple[float, float] | None = None,
+        interval: str | None = None,
     ) -> dict[str, Any]:
         found: dict[str, Any] = {"left out": name, "fixed [%]": fixed}
         for mode in modes:
             found[mode] = values[mode]
             if mode == ADAPTIVE:
-                found[f"{mode}, 95 %"] = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
+                found[f"{mode}, 95 %"] = interval
         return found
 
     rows = []
@@ -326,7 +328,7 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         ratios = {mode: float(validation.ratios[mode][i]) for mode in modes}
         errors, fixed = sequence.errors[ADAPTIVE], sequence.errors["fixed"]
         # It is about this sequence, and says nothing about other places.
-        interval = ratio([Pair(np.stack([errors, fixed]), sequence.span)]).interval
+        interval = in_cell(ratio([Pair(np.stack([errors, fixed]), sequence.span)]).interval)
         rows.append(row(sequence.name, fixed.mean(), ratios, interval))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
@@ -335,8 +337,9 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         values = {mode: summaries[mode][key] for mode in modes}
         of_mean = key == "geometric"
-        ends = (summaries[ADAPTIVE]["low"], summaries[ADAPTIVE]["high"]) if of_mean else None
-        rows.append(row(key.replace("_", " "), None, values, ends))
+        few = len(validation.recordings) < MIN_BLOCKS
+        ends = None if few else (summaries[ADAPTIVE]["low"], summaries[ADAPTIVE]["high"])
+        rows.append(row(key.replace("_", " "), None, values, in_cell(ends) if of_mean else None))
     return rows
 
 

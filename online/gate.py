@@ -13,7 +13,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
-from adaptune.paired import Pair, Ratio, ratio
+from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.report.tables import Listing, markdown
 from adaptune.study.driven import PER_STRETCH
 from adaptune.study.study import Study, is_written_to
@@ -85,7 +85,7 @@ class GateRow(NamedTuple):
 
     def columns(self) -> dict[str, Any]:
         """The row of a table."""
-        ends = None if self.low is None else f"{self.low:.3f}-{self.high:.3f}"
+        ends = None if self.low is None or self.high is None else (self.low, self.high)
         worst = max(self.stretches, key=lambda stretch: stretch[1], default=None)
         return {
             "recording": self.recording,
@@ -93,7 +93,7 @@ class GateRow(NamedTuple):
             "new": self.new,
             "old": self.old,
             "ratio": self.ratio,
-            "interval": ends,
+            "interval": ends and in_cell(ends, 3),
             "verdict": self.verdict + (f": {self.why}" if self.why else ""),
             "worst stretch": worst and f"{worst[1]:.2f} at {worst[0]:.0f} s",
         }

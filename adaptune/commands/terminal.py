@@ -67,15 +67,15 @@ _ORDER = "own parameters, within the budget, no more CPU time, just below the bu
 
 def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> None:
     """The table of what CPU time buys."""
+    from adaptune.paired import in_cell
+
     shown = [
         {
             "": "-> " * row["recommended"] + min(row["what"].split(", "), key=_ORDER.find),
             **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
             "RTE [%]": row["error [%]"],
             "elsewhere": row["vs baseline"],
-            "95 %": None
-            if row["low"] is None or row["low"] != row["low"]
-            else f"{row['low']:.2f}-{row['high']:.2f}",
+            "95 %": in_cell((row["low"], row["high"])) if row["low"] else None,
             "parameters": row["parameters"],
         }
         for row in rows

@@ -69,10 +69,17 @@ class Tuned:
 
     @property
     def errors(self) -> Any:
-        """Errors by frame in training, a column for each set, with descriptors and folds."""
+        """Errors by frame in training, a column for each set, with time, place and descriptors.
+
+        The `attrs` of the data frame have each column's parameters.
+        """
         from offline.scenario import scenario
 
-        return _table(scenario(self.study).columns())
+        found = scenario(self.study)
+        table = _table(found.columns())
+        if hasattr(table, "attrs"):
+            table.attrs |= {f"rte_{trial}": found.sets[trial] for trial in found.sets}
+        return table
 
     @property
     def modes(self) -> Any:
@@ -147,7 +154,7 @@ def _table(rows: Any) -> Any:
         import pandas as pd
     except ImportError:
         return rows
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).rename(columns=lambda name: name.lstrip("_"))
 
 
 def tune(
