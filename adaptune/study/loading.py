@@ -251,6 +251,9 @@ def _read(path: Path) -> yaml12.Document:
         raise ConfigurationError(str(error)) from error
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
+    if document.data.keys().isdisjoint(("odometry", "sequences", "courses", "training")):
+        what = "is no study, it names no odometry and no recordings"
+        raise ConfigurationError(f"{path}: {what}; a parameter file goes with a bag, as --config")
     return document
 
 

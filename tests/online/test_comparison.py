@@ -11,7 +11,7 @@ import pytest
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
-from adaptune.model.rules import mean_errors
+from adaptune.model.rules import SetCost, mean_errors
 from adaptune.study.driven import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
@@ -41,13 +41,14 @@ def replayed(trained):
 def test_where_track_is_lost_it_names_what_kept_it_in_training(replayed, monkeypatch):
     monkeypatch.setattr("adaptune.metrics.LOST_ABOVE", -1.0)
     model = ErrorModel.load(replayed.model_path)
-    costs = [model.costs.alone(trial) for trial in model.sets]
-    dear = replace(model, fixed=model.sets.trials[int(np.argmin(costs))])
+    means = mean_errors(model.errors, model.sequence)
+    best = model.sets.trials[int(means.argmin())]
+    costs = {trial: SetCost(1.0 + (trial == best), 0.0, 0) for trial in model.sets}
+    cheap = next(trial for trial in model.sets if trial != best)
+    dear = replace(model, fixed=cheap, costs=replace(model.costs, sets=costs))
     monkeypatch.setattr("online.compare.current_replays", lambda *_: (dear, None, []))
     found = compare(replayed)
     assert found.advised == NONE
-    means = mean_errors(model.errors, model.sequence)
-    best = model.sets.trials[int(means.argmin())]
     assert found.verdict[-1].startswith(f"In training trial {best} has {means.min():.2f} % at ")
     monkeypatch.setattr("online.compare.LOST_ABOVE", 0.0)
     assert compare(replayed).verdict == found.verdict[:-1]
