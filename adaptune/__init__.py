@@ -1,6 +1,7 @@
 """What both stages share: the vocabulary, the data, the black boxes and the error model.
 
-`tune` does all of it in one call, see `adaptune.tuning.tuned.tune`; `evaluate` judges trajectories,
+`tune` does all of it in one call, see `adaptune.tuning.tuned.tune`; `compare` says whether one
+odometry is worse than another, see `adaptune.tuning.sides.compare`; `evaluate` judges trajectories,
 see `adaptune.evaluation.evaluated.evaluate`.
 """
 
@@ -9,14 +10,23 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+_FUNCTIONS = {
+    "compare": "adaptune.tuning.sides",
+    "evaluate": "adaptune.evaluation.evaluated",
+    "tune": "adaptune.tuning.tuned",
+}
+"""By name, the modules of functions. Layers below do not see them, though they import this one."""
+
+
+def __dir__() -> list[str]:
+    return ["__version__", *_FUNCTIONS]
+
 
 def __getattr__(name: str) -> "Any":
-    if name in ("tune", "evaluate"):
+    if name in _FUNCTIONS:
         from importlib import import_module
 
-        # Layers below do not see them, though they import this package.
-        homes = {"tune": "adaptune.tuning.tuned", "evaluate": "adaptune.evaluation.evaluated"}
-        return getattr(import_module(homes[name]), name)
+        return getattr(import_module(_FUNCTIONS[name]), name)
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import version

@@ -83,6 +83,15 @@ def pooled(
     return Ratio(math.exp(mean), (math.exp(mean - margin), math.exp(mean + margin)), error)
 
 
+def in_cell(ends: Interval, digits: int = 2) -> str:
+    """An interval in a table; without a spread, both sides are the same run."""
+    if ends is None or not math.isfinite(ends[1]):
+        return "too few"
+    if ends == (1.0, 1.0):
+        return "the same"
+    return f"{ends[0]:.{digits}f}-{ends[1]:.{digits}f}"
+
+
 def joined(errors: ArrayLike, freedom: ArrayLike) -> tuple[float, float]:
     """Standard error of a sum, and its degrees of freedom (Welch and Satterthwaite)."""
     variances, each = np.square(np.asarray(errors, float)), np.asarray(freedom, float)

@@ -1,6 +1,7 @@
 """How far a long task is, and how that is shown."""
 
 import logging
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -33,8 +34,8 @@ def watched(scans: Iterable[T], n: int, what: str, progress: Progress) -> Iterat
     progress(what, done, done)
 
 
-LOG_EVERY = 5.0
-"""Seconds between two lines about progress in a log."""
+LOG_EVERY, BRIEF = 5.0, 2.0
+"""Seconds between two lines about progress in a log, and of a task that gets none."""
 MOST_FINISHED = 8
 """Bars that stay on the screen when they are full."""
 
@@ -72,7 +73,8 @@ def bars(console: "Console") -> Iterator[Progress]:
         shown.update(task.id, completed=done, total=max(total, done))
         words = ", ".join(filter(None, (_time_left(task), remark)))
         shown.update(task.id, remark=words)
-        if not console.is_terminal and time.monotonic() - logged > LOG_EVERY:
+        due = time.monotonic() - logged > LOG_EVERY and (task.elapsed or 0.0) > BRIEF
+        if due and not console.is_terminal:
             logged = time.monotonic()
             log.info("%s: %d of %d%s", what, done, total, words and f", {words}")
 
@@ -87,7 +89,11 @@ def bars_and_words() -> Iterator[Progress]:
     from rich.highlighter import NullHighlighter
     from rich.logging import RichHandler
 
-    console = Console(stderr=True, force_jupyter=False, emoji=False, highlight=False)
+    # A notebook asks for colours, and stores all that is written.
+    live = sys.stderr.isatty()
+    console = Console(
+        stderr=True, force_terminal=live, force_jupyter=False, emoji=False, highlight=False
+    )
     with bars(console) as show, ExitStack() as stack:
         if not logging.getLogger().handlers:
             handler = RichHandler(

@@ -130,7 +130,8 @@ def front_chart(table: TrialTable) -> Chart | None:
         "Error over cost of all that was tried",
         (Panel(x, y, tuple(drawn), height=1.3),),
         "Nothing that was tried has both less error and less cost than what lies on the front. "
-        "Where the front is flat, more CPU time buys nothing.",
+        "Where the front is flat, more CPU time buys nothing. Errors are those of `trials.csv`, of "
+        "stretches; `front.csv` has those of whole drives, which only the best sets drive.",
     )
 
 

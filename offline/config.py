@@ -490,7 +490,8 @@ def load_study(
 ) -> OfflineStudy:
     """Read and check a whole study, see `adaptune.study.loading.read_study`.
 
-    It is a YAML file, its data, or the folder of a study that has begun.
+    It is a YAML file, its data, or the folder of a study that has begun. If nothing is to run, the
+    odometry is not `needed`: what a folder holds is read without a class that is not here.
     """
     from adaptune.study.loading import read_study  # which opens recordings
 

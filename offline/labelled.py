@@ -304,6 +304,11 @@ class LabelledSequence:
         return self.simulation.ends[self.known]
 
     @property
+    def seconds(self) -> NDArray[np.float64]:
+        """When the frames are, from the first scan, of shape (n,)."""
+        return np.asarray(1e-9 * (self.simulation.stamps[self.known] - self.simulation.stamps[0]))
+
+    @property
     def positions(self) -> NDArray[np.float64]:
         """Where the frames are in metres, of shape (n, 3)."""
         return self.simulation.T_ref_sensor[self.known, :3, 3]

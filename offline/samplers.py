@@ -309,7 +309,7 @@ class AskedSampler(Sampler):
                 decoded[name] = p.choices[value]
                 continue
             inside = min(max(value, p.low), p.high)
-            decoded[name] = float(inside) if isinstance(p, Float) else int(inside)
+            decoded[name] = p.rounded(float(inside)) if isinstance(p, Float) else int(inside)
         return decoded
 
 

@@ -5,6 +5,7 @@ Instances are frames, algorithms are parameter sets. So selection rules compare 
 
 import csv
 import json
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +16,16 @@ from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
-from adaptune.model import Rule, TrainingData
+from adaptune.model import ErrorModel, Rule, TrainingData
 from adaptune.model.registry import asked, selected
-from adaptune.model.rules import Costs, SetCost
-from adaptune.paired import MIN_RECORDINGS
+from adaptune.model.rules import Costs, FixedSet, SetCost
+from adaptune.paired import MIN_BLOCKS, MIN_RECORDINGS, of_stretches
 from adaptune.report.tables import csv_text
 from adaptune.space import ParameterSets, load_space
 from offline.choice import BlockErrors, choose
 from offline.config import OfflineStudy
 from offline.labelled import block_means, labelled_data
+from offline.tuning import log_ratios
 
 
 class Scenario(NamedTuple):
@@ -34,12 +36,16 @@ class Scenario(NamedTuple):
     end: NDArray[np.intp]  # (n,): last frame of its sub-trajectory
     stretch: NDArray[np.intp]  # (n,): number of its stretch
     fold: NDArray[np.intp]  # (n,): of a recording or, with few of them, of a stretch
+    time: NDArray[np.float64]  # (n,): seconds from the sequence's first scan
+    place: NDArray[np.float64]  # (n, 3): metres, by the reference
     features: NDArray[np.float32]  # (n, n_features): averaged descriptors
     # (n, n_sets): RTE in percent, infinite where the track was lost
     performances: NDArray[np.float32]
     blocks: dict[str, int]  # by name, in order, the number of features of each descriptor
     sets: ParameterSets
     cost: NDArray[np.float64]  # (n_sets,): milliseconds of CPU time a scan; NaN if unknown
+    # Trials that `online` lets a rule select: a bank's members, or what is within the budget.
+    candidates: tuple[int, ...]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """What is known of frames, as columns of equal length."""
@@ -47,7 +53,8 @@ class Scenario(NamedTuple):
         errors = {
             f"rte_{n}": values for n, values in zip(self.sets, self.performances.T, strict=True)
         }
-        return {name: getattr(self, name) for name in _OF_FRAMES} | features | errors
+        where = {"time": self.time} | dict(zip("xyz", self.place.T, strict=True))
+        return {name: getattr(self, name) for name in _OF_FRAMES} | where | features | errors
 
     def fixed(self, frames: NDArray[np.bool_]) -> int:
         """Trial number of the fixed set by some frames, with their stretches as blocks."""
@@ -57,8 +64,33 @@ class Scenario(NamedTuple):
         errors, restarts = block_means(self.performances[frames], stretch), np.zeros(len(self.sets))
         return choose(BlockErrors(self.sets.trials, errors, sequence, self.cost, restarts))
 
-    def score(self, rule: Rule) -> NDArray[np.float64]:
-        """Capped errors in percent of the sets that a rule selects, of shape (n,).
+    def score(self, *rules: Rule) -> list[dict[str, Any]]:
+        """A row each for rules, and for the fixed set, the best single set and the best of all.
+
+        Columns are the mean error in percent, the ratio to the fixed set's with its 95 % interval,
+        and the cost. The last two are known in hindsight only. See `select`.
+        """
+        capped, column = cap(self.performances), list(self.sets.trials).index
+        some = [column(trial) for trial in self.candidates]
+        single = some[int(np.argmin(capped[:, some].mean(axis=0)))]
+        chosen = {type(rule).__name__: self.select(rule) for rule in rules}
+        chosen |= {"fixed": self.select(FixedSet())}
+        chosen |= {"best single set": np.full(len(capped), single)}
+        chosen["oracle"] = np.array(some)[np.argmin(capped[:, some], axis=1)]
+        frames, rows = np.arange(len(capped)), []
+        of = capped[frames, chosen["fixed"]]
+        _, first = np.unique(self.stretch, return_index=True)
+        for name, columns in chosen.items():
+            errors, cost = capped[frames, columns], float(self.cost[columns].mean())
+            logs = log_ratios(errors, of, self.stretch)
+            value, ends, _ = of_stretches(logs, self.sequence[first].tolist())
+            low, high = ends if ends and len(logs) >= MIN_BLOCKS else (None, None)
+            row = {"rule": name, "RTE [%]": float(errors.mean()), "vs fixed": value}
+            rows.append(row | {"low": low, "high": high, "cost [ms]": cost})
+        return rows
+
+    def select(self, rule: Rule) -> NDArray[np.intp]:
+        """Columns of the sets that a rule selects among the `candidates`, of shape (n,).
 
         Each fold is left out in turn, and with it the frames whose sub-trajectories overlap it. The
         rule is fitted to the rest, with the fixed set of the rest.
@@ -72,7 +104,7 @@ class Scenario(NamedTuple):
             raise AdaptuneError(f"{rule.__name__}: is a class; give an object, {rule.__name__}()")
         from adaptune.model.knn import ScaledPCA  # takes long to import
 
-        errors = np.empty(len(self.frame))
+        found = np.empty(len(self.frame), np.intp)
         each = {n: SetCost(cost, 0.0, n) for n, cost in zip(self.sets, self.cost, strict=True)}
         for fold in np.unique(self.fold):
             left_out = self.fold == fold
@@ -83,14 +115,20 @@ class Scenario(NamedTuple):
             features = pca.fit(self.features[rest]).transform(self.features)
             of_rest = features[rest], self.stretch[rest], self.performances[rest]
             fixed, costs = self.fixed(rest), Costs(each, 0.0)
-            asked(rule.fit, TrainingData(*of_rest, self.sets, fixed, costs=costs))
+            some = tuple(dict.fromkeys((fixed, *self.candidates)))
+            asked(rule.fit, TrainingData(*of_rest, self.sets, fixed, some, costs=costs))
             for i in np.flatnonzero(left_out):
                 selection = selected(rule, self.sets, features[i])
                 if selection.weights is not None:
                     why = "its error is not one of the table's; take `adaptune validate`"
                     raise AdaptuneError(f"{type(rule).__name__}: weighs a bank: {why}")
-                errors[i] = self.performances[i, self.sets.column(selection.trial)]
-        return cap(errors)
+                if selection.trial not in some:
+                    raise AdaptuneError(
+                        f"{type(rule).__name__}: selects trial {selection.trial}, which is none of "
+                        f"data.candidates"
+                    )
+                found[i] = self.sets.column(selection.trial)
+        return found
 
     def _overlapping(self, left_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Frames of the same sequences whose sub-trajectories overlap those of some frames."""
@@ -129,12 +167,26 @@ def scenario(study: OfflineStudy) -> Scenario:
         np.concatenate([s.ends for s in data.sequences]),
         data.stretches(),
         fold,
+        np.concatenate([s.seconds for s in data.sequences]),
+        np.concatenate([s.positions for s in data.sequences]),
         np.concatenate([s.descriptors for s in data.sequences]),
         data.errors(),
         dict(data.sequences[0].blocks),
         sets,
         np.array([data.costs.alone(n) for n in numbers]),
+        _candidates(study, numbers),
     )
+
+
+def _candidates(study: OfflineStudy, numbers: Sequence[int]) -> tuple[int, ...]:
+    """Those of some trials that `online` lets a rule select; all before there is a model."""
+    if not study.model_path.exists():
+        return tuple(numbers)
+    model = ErrorModel.load(study.model_path)
+    some: Collection[int] = model.allowed() or model.sets
+    if study.mechanism == "bank" and not study.odometry.description.live:
+        some = [trial for trial in model.bank if trial not in model.reserve]
+    return tuple(n for n in numbers if n in {model.fixed, *some})
 
 
 def write_scenario(path: Path | str, found: Scenario) -> Path:
@@ -152,6 +204,7 @@ def write_scenario(path: Path | str, found: Scenario) -> Path:
         for n, cost in zip(found.sets, found.cost, strict=True)
     ]
     about = {"blocks": found.blocks, "space": found.sets.space.dump(), "sets": known}
+    about |= {"candidates": found.candidates}
     write_text(_sets_path(path), json.dumps(about, indent=1))
     return _sets_path(path)
 
@@ -176,11 +229,14 @@ def read_scenario(path: Path | str) -> Scenario:
             end,
             stretch,
             fold,
+            columns["time"].astype(float),
+            np.stack([columns[axis].astype(float) for axis in "xyz"], axis=1),
             features.astype(np.float32),
             errors.astype(np.float32),
             about["blocks"],
             ParameterSets(load_space(about["space"]), tuple(trials), tuple(parameters)),
             np.array(costs, float),
+            tuple(about["candidates"]),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         both = f"{path}, with {_sets_path(path).name} beside it"

@@ -6,7 +6,7 @@ looked up, period by period; no odometry runs.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from adaptune.metrics import cap
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, asked, rule_class, selected
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
-from adaptune.paired import MIN_RECORDINGS, Pair, ratio
+from adaptune.paired import MIN_BLOCKS, MIN_RECORDINGS, Pair, in_cell, ratio
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
@@ -164,6 +164,7 @@ def leave_one_out(
     progress: Progress = unseen,
     bank: int = BANK_SIZE,
     rules: Sequence[str] = tuple(RULES),
+    among_members: bool = False,
 ) -> Validation:
     """Leave each recording or stretch out in turn.
 
@@ -171,7 +172,8 @@ def leave_one_out(
     figures are those of the choice, and not of what was best in hindsight.
 
     `bank` is the number of a bank's members, 0 for none; `rules` are names, see
-    `adaptune.model.registry`. There is a ValidationError if there are fewer than two folds.
+    `adaptune.model.registry`, which select among the bank's members where `online` lets them do so.
+    There is a ValidationError if there are fewer than two folds.
     """
     by_recording = len(data.recordings) >= MIN_RECORDINGS
     folds = data.folds(by_recording)
@@ -187,7 +189,7 @@ def leave_one_out(
     parts: dict[str, list[LeftOut]] = {}
     for i, (left_out, others) in enumerate(folds):
         progress("parts left out", i, len(folds))
-        part = leave_out(left_out, others, bank, by_recording, rules)
+        part = leave_out(left_out, others, bank, by_recording, rules, among_members)
         parts.setdefault(part.name, []).append(part)
     progress("parts left out", len(folds), len(folds))
     return Validation([joined(of_recording) for of_recording in parts.values()])
@@ -199,8 +201,9 @@ def leave_out(
     bank: int,
     by_recording: bool,
     rules: Sequence[str] = tuple(RULES),
+    among_members: bool = False,
 ) -> LeftOut:
-    """Fit on the others, and look up what happens on what is left out."""
+    """Fit on the others, and look up what happens on what is left out; see `leave_one_out`."""
     fitted = data, pca = others.training_data()
     features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)
@@ -209,21 +212,27 @@ def leave_out(
     frames = np.arange(len(capped))
     errors, adapted = {"baseline": capped[:, data.sets.column(BASELINE)], "fixed": fixed}, {}
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
-    alone, costs = others.costs.alone, dict[str, float]()
+    alone, costs, members = others.costs.alone, dict[str, float](), tuple(chosen.members)
+    of_bank, some = data, members or (data.fixed,)
+    if among_members:
+        vectors = others.vectors(members) if members else None
+        of_bank = replace(data, candidates=some, vectors=vectors)
     for name in (name for name in rules if name not in (ADAPTIVE, STANDBY)):
         rule = asked(rule_class(name).of, None)
-        asked(rule.fit, data)
+        asked(rule.fit, of_bank)
         trials = [selected(rule, data.sets, features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
         costs[name] = float(np.mean([alone(trial) for trial in trials]))
+        if among_members and members:  # all of them run
+            costs[name] = others.costs.adaptive(members)
     costs |= {"baseline": alone(0), "fixed": alone(data.fixed), ADAPTIVE: alone(data.fixed)}
     errors[ADAPTIVE], adapted[ADAPTIVE] = fixed, 0.0
-    if len(chosen.members) > 1:
-        simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
+    if len(members) > 1:
+        simulated = bank_errors(sequence, others, fitted, members, [chosen.bank])
         errors[ADAPTIVE], weights = next(simulated)
         adapted[ADAPTIVE] = float(1.0 - weights[:, 0].mean())
-        costs[ADAPTIVE] = others.costs.adaptive(chosen.members)
+        costs[ADAPTIVE] = others.costs.adaptive(members)
     # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     about = (sequence.name, sequence.recording, sequence.stretch, sequence.span)
@@ -255,10 +264,10 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         )
     data = _labelled(study, model)
     online = driven(model, study.config.online, study.odometry, study.mechanism)
-    adapts = study.mechanism == "bank" and ADAPTIVE in study.rules
-    bank = study.config.online.switching.size if adapts else 0
+    bank = study.config.online.switching.size if study.mechanism == "bank" else 0
+    among_members = bank > 0 and not study.odometry.description.live
     try:
-        validation = leave_one_out(data, progress, bank, study.rules)
+        validation = leave_one_out(data, progress, bank, study.rules, among_members)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online}") from error
     rows = _rows(validation)
@@ -267,7 +276,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     tables.write_rows(study.folder, "stretches", stretches)
     if (chart := stretch_chart(stretches)) is not None:
         draw_chart(chart, *(study.folder / f"validation.{kind}" for kind in ("png", "svg")))
-    said = [online, *_verdicts(study.rules, study.mechanism == "bank", validation)]
+    said = [online, *_verdicts(study.rules, bank > 0, validation)]
     estimates = estimates_of(study.sequences, study.training)
     said += estimates_in_words(estimates, model.length)
     return Validated(validation, rows, said)
@@ -280,20 +289,19 @@ def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> lis
         said.append(validation.verdict(ADAPTIVE))
     said.append(baseline_in_words(validation))
     others = [name for name in rules if name not in (ADAPTIVE, STANDBY)]
-    if bank and others:
-        why = "`online` lets it choose among the bank's members, here it chooses among all sets"
-        return [*said, *(f"`{name}` has no verdict: {why}." for name in others)]
     return [*said, *map(validation.verdict, others)]
 
 
 def baseline_in_words(validation: Validation) -> str:
     """How the baseline compares; the study's own fixed set is another than those compared with."""
-    s = validation.summary("baseline")
+    s, parts = validation.summary("baseline"), f"{len(validation.recordings)} stretches"
+    if s["low"] == s["high"]:
+        return f"Without what is left out, the baseline is chosen each time, over {parts}."
     better = ": there the baseline is better" if s["high"] < 1.0 else ""
     return (
         f"The baseline has {s['geometric']:.2f} times the error of the sets that are chosen "
-        f"without what is left out, over {len(validation.recordings)} stretches (95 % interval "
-        f"{s['low']:.2f}-{s['high']:.2f}){better}."
+        f"without what is left out, over {parts} (95 % interval "
+        f"{in_cell((s['low'], s['high']))}){better}."
     )
 
 
@@ -312,13 +320,13 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         name: str,
         fixed: float | None,
         values: Mapping[str, float],
-        interval: tuple[float, float] | None = None,
+        interval: str | None = None,
     ) -> dict[str, Any]:
         found: dict[str, Any] = {"left out": name, "fixed [%]": fixed}
         for mode in modes:
             found[mode] = values[mode]
             if mode == ADAPTIVE:
-                found[f"{mode}, 95 %"] = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
+                found[f"{mode}, 95 %"] = interval
         return found
 
     rows = []
@@ -326,7 +334,7 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         ratios = {mode: float(validation.ratios[mode][i]) for mode in modes}
         errors, fixed = sequence.errors[ADAPTIVE], sequence.errors["fixed"]
         # It is about this sequence, and says nothing about other places.
-        interval = ratio([Pair(np.stack([errors, fixed]), sequence.span)]).interval
+        interval = in_cell(ratio([Pair(np.stack([errors, fixed]), sequence.span)]).interval)
         rows.append(row(sequence.name, fixed.mean(), ratios, interval))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
@@ -335,8 +343,9 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         values = {mode: summaries[mode][key] for mode in modes}
         of_mean = key == "geometric"
-        ends = (summaries[ADAPTIVE]["low"], summaries[ADAPTIVE]["high"]) if of_mean else None
-        rows.append(row(key.replace("_", " "), None, values, ends))
+        few = len(validation.recordings) < MIN_BLOCKS
+        ends = None if few else (summaries[ADAPTIVE]["low"], summaries[ADAPTIVE]["high"])
+        rows.append(row(key.replace("_", " "), None, values, in_cell(ends) if of_mean else None))
     return rows
 
 

@@ -13,7 +13,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
-from adaptune.paired import Pair, Ratio, ratio
+from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.report.tables import Listing, markdown
 from adaptune.study.driven import PER_STRETCH
 from adaptune.study.study import Study, is_written_to
@@ -85,7 +85,7 @@ class GateRow(NamedTuple):
 
     def columns(self) -> dict[str, Any]:
         """The row of a table."""
-        ends = None if self.low is None else f"{self.low:.3f}-{self.high:.3f}"
+        ends = None if self.low is None or self.high is None else (self.low, self.high)
         worst = max(self.stretches, key=lambda stretch: stretch[1], default=None)
         return {
             "recording": self.recording,
@@ -93,7 +93,7 @@ class GateRow(NamedTuple):
             "new": self.new,
             "old": self.old,
             "ratio": self.ratio,
-            "interval": ends,
+            "interval": ends and in_cell(ends, 3),
             "verdict": self.verdict + (f": {self.why}" if self.why else ""),
             "worst stretch": worst and f"{worst[1]:.2f} at {worst[0]:.0f} s",
         }
@@ -105,6 +105,9 @@ class Gate(NamedTuple):
     verdict: Verdict
     rows: list[GateRow]
     words: str  # in one line
+    odometry: str = ""  # the new side's
+    mode: str = ""  # in which both were driven
+    length: float = np.nan  # metres over which errors are measured
 
 
 def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
@@ -283,7 +286,9 @@ def compare_sides(
     rows += [_restarts(pairs, share), *_lacking(pairs)]
     verdict = _overall(rows)
     left_out = f" Not compared: {shared.alone}." if shared.alone else ""
-    return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out)
+    words, study = _in_words(shared, verdict, rows) + left_out, shared.new.study
+    length = study.config.sub_trajectory
+    return Gate(verdict, rows, words, study.odometry.name, shared.mode, length)
 
 
 def _rows(
@@ -389,15 +394,15 @@ def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
     return f"{first}: {shared.new.name} against {shared.old.name}, {of}: {'; '.join(parts)}.{where}"
 
 
-def write_gate(folder: Path, gate: Gate, shared: Shared) -> None:
+def write_gate(folder: Path, gate: Gate) -> None:
     """Write ``verdict.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
     # Of the error over all, which comes last.
     error = [row for row in gate.rows if row.quantity == ERROR][-1]
     data = {
         "action": gate.verdict if gate.verdict in ("worse", "unclear") else "pass",
         "verdict": gate.verdict,
-        "odometry": shared.new.study.odometry.name,
-        "mode": shared.mode,
+        "odometry": gate.odometry,
+        "mode": gate.mode,
         "ratio": error.ratio,
         "interval": [error.low, error.high],
         "why": [gate.words],

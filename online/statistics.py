@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.metrics import cap
-from adaptune.paired import Interval, Pair, Ratio, interval_of_mean, ratio
+from adaptune.paired import Interval, Pair, Ratio, in_cell, interval_of_mean, ratio
 from adaptune.reference.judge import Reference, StandardErrors, columns_of
 from adaptune.study.oracle import OracleErrors
 from adaptune.trajectory import Trajectory
@@ -37,6 +37,7 @@ class ComparisonRow:
     poor_scans: int = 0  # too poor to register
     rte_interval: Interval = None
     ratio_interval: Interval = None
+    blocks: int | None = None  # sub-trajectories that follow each other: what intervals rest on
     standard: StandardErrors | None = None
     first_restart: float | None = None  # seconds from the start
     unhealthy: tuple[str, ...] = ()  # what the health check found
@@ -61,22 +62,23 @@ class ComparisonRow:
     against: Mapping[str, Ratio] = field(default_factory=dict)
 
     def columns(self) -> dict[str, Any]:
-        """The row of a table; columns that begin with an underscore are for files only."""
+        """The row of a table in a file: all that is known, ends of intervals as numbers."""
         more: dict[str, Any] = {n: getattr(self, n) for n in ("reference_error", "poor_scans")}
         for name in ("rte", "ratio", "estimated"):
             ends = getattr(self, f"{name}_interval")
             more[f"{name}_low"], more[f"{name}_high"] = ends or (None, None)
         more |= {n: getattr(self, n) for n in ("worst_tenth", "better", "worse")}
         more |= self._standard() | dict(self.real_time or {})
-        return {"sequence": self.sequence, **self._shown()} | {f"_{k}": v for k, v in more.items()}
+        shown = {key: value for key, value in self._shown().items() if key != "95 %"}
+        return {"sequence": self.sequence, **shown, "blocks": self.blocks} | more
 
     def _shown(self) -> dict[str, Any]:
-        ends = self.ratio_interval
+        itself = self.ratio is None or self.mode in (self.yardstick, ORACLE)
         return {
             "mode": self.mode,
             "RTE [%]": self.rte,
             f"vs {self.yardstick}": self.ratio,
-            "95 %": None if ends is None else f"{ends[0]:.2f}-{ends[1]:.2f}",
+            "95 %": None if itself else in_cell(self.ratio_interval),
             "estimated [%]": self.estimated,
             "lost [s]": self.lost_seconds,
             "restarts": self.restarts,
@@ -196,6 +198,7 @@ def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
         ratio=found.value,
         rte_interval=interval_of_mean(mine, judged.block, row.reference_error),
         ratio_interval=found.interval,
+        blocks=len(mine) // judged.block,
     )
 
 

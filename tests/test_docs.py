@@ -276,7 +276,7 @@ def test_python_works():
             assert {"trial", "keyframe_interval", "mean"} <= set(names["tuned"].trials)
             assert repr(names["tuned"]).endswith("/runs/hall/report/report.html>")
         if "read_scenario" in code:
-            assert names["errors"].score(FixedSet()).mean() > 0.0
+            assert names["errors"].score(FixedSet())[0]["RTE [%]"] > 0.0
             shown = {key: repr(names[key]) for key in ("study", "trained")}
             assert "<Study in runs/my: " in shown["study"]
 
@@ -299,6 +299,9 @@ def test_the_notebook_runs_and_so_does_the_readme(folder, monkeypatch):
     tuned = names["tuned"]
     assert tuned.study.config.online.budget == 1e6
     assert [f"rte_{n}" for n in tuned.trials["trial"]] == list(tuned.errors.filter(like="rte_"))
+    assert set(tuned.errors.attrs) == set(tuned.errors.filter(like="rte_"))
+    assert tuned.errors["time"].is_monotonic_increasing
+    assert {"blocks", "ratio_low", "ratio_high"} <= set(tuned.modes)
     assert '<img style="max-width: 100%" src="data:image/png;base64,' in tuned._repr_html_()
     assert {"study", "fixed", "model", "page", "trials", "comparison"} <= set(tuned.files)
     assert {"baseline", "fixed"} <= set(tuned.modes["mode"])

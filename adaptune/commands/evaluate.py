@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from adaptune.commands.online import WORSE, Details, share_of
+from adaptune.commands.online import WORSE, Details, percent
 from adaptune.commands.terminal import As, Given, Points, progress, say, show_table
 
 Words = Annotated[
@@ -59,7 +59,7 @@ def evaluate(
     from adaptune.evaluation.given import parted
     from adaptune.evaluation.shown import tables
 
-    limit = None if most is None else 100.0 * share_of(most, "max")
+    limit = None if most is None else percent(most, "max")
     bags, trajectories = parted(words)
     place = None if extrinsic is None else extrinsic.strip("[] ").replace(",", " ").split()
     with progress() as show:

@@ -299,32 +299,27 @@ def _gate(
     out: Path,
 ) -> None:
     """Say whether the first side is worse than the second one, and exit with a code."""
-    from adaptune.tuning.sides import costs, sides
-    from online.gate import compare_sides, shared_replays, write_gate
+    from adaptune.tuning.sides import gated
+    from online.gate import write_gate
 
-    error, cost = (
-        math.inf if (key, text) == ("cost", "off") else share_of(text, key)
-        for key, text in zip(("worse", "cost"), percents, strict=True)
-    )
+    worse, cost = percents
+    bounds = percent(worse, "worse"), None if cost == "off" else percent(cost, "cost")
     with progress() as show:
-        both = sides(given, asked, length, show)
-        shared = shared_replays(*both)
-        measured = costs(shared, show) if cost < math.inf else None
-    gate = compare_sides(shared, measured, error, cost)
-    write_gate(out, gate, shared)
+        gate = gated(given, asked, bounds, length, show)
+    write_gate(out, gate)
     say(gate.words)
-    metres = both[0].study.config.sub_trajectory
-    show_table(f"New against old, RTE over {metres:g} m", [row.columns() for row in gate.rows])
+    title = f"New against old, RTE over {gate.length:g} m"
+    show_table(title, [row.columns() for row in gate.rows])
     say(f"Files: {out}/verdict.json, junit.xml, summary.md")
     if gate.verdict == "worse" or (gate.verdict == "unclear" and unclear == "fail"):
         raise typer.Exit(WORSE)
 
 
-def share_of(text: str, key: str) -> float:
-    """A percentage of an option, as a share."""
+def percent(text: str, key: str) -> float:
+    """The percentage of an option."""
     with suppress(ValueError):
-        if 0.0 <= (share := float(text.removesuffix("%")) / 100.0) < math.inf:
-            return share
+        if 0.0 <= (value := float(text.removesuffix("%"))) < math.inf:
+            return value
     off = ", or `off`" * (key == "cost")
     raise AdaptuneError(f"--{key} {text}: give a percentage, as in --{key} 5%{off}")
 

@@ -25,7 +25,9 @@ _literal: Any = {"markup": False, "emoji": False, "highlight": False}
 # In a pipe, tables are not wrapped, unless COLUMNS gives a width.
 _wide = None if "COLUMNS" in os.environ else 200
 console = Console(width=None if sys.stdout.isatty() else _wide, **_literal)
-errors = Console(stderr=True, width=None if sys.stderr.isatty() else _wide, **_literal)
+# Where it is stored, bars would fill it, whatever FORCE_COLOR says.
+_live = sys.stderr.isatty()
+errors = Console(stderr=True, force_terminal=_live, width=None if _live else _wide, **_literal)
 
 
 class Commands(TyperGroup):

@@ -298,6 +298,8 @@ class Odometry(ABC):
         checks ranges. There is an `OdometryError` if there is no such parameter.
     settings
         An instance of `settings_type`.
+    values
+        Parameters by their names, as in ``MyIcp(voxel=0.5)``.
     """
 
     space: ClassVar[ParameterSpace]
@@ -307,10 +309,14 @@ class Odometry(ABC):
     needs_imu: ClassVar[bool] = False
 
     def __init__(
-        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
+        self,
+        parameters: ParameterSet | None = None,
+        settings: BaseSettings | None = None,
+        **values: Any,
     ):
         self.settings: Any = self.settings_type() if settings is None else settings
-        self.parameters = self.tuned(settings).baseline | self._known(parameters or {})
+        given = (parameters or {}) | values
+        self.parameters = self.tuned(settings).baseline | self._known(given)
 
     @classmethod
     def tuned(cls, settings: Any) -> ParameterSpace:

@@ -57,6 +57,10 @@ PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgic
 """Packages that our odometries run on, where they are not named as the adapter's module is."""
 
 
+ABSENT = set[str]()
+"""Classes of users' that cannot be imported here, and of which only results are read."""
+
+
 def is_user_class(name: str) -> bool:
     """Whether an odometry is a class that is not adaptune's: another package's, or the user's."""
     return name not in ODOMETRIES and name not in PROGRAMS
@@ -146,6 +150,8 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
     if not is_user_class(name):
         return declare_here(name, settings, folder)
     given = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
+    if name in ABSENT:
+        return Declaration(UserSettings(given), [], Description(None, live=False))
     answer = _ask(name, json.dumps(given, default=str), str(folder or ""))
     described = {key: answer[key] for key in Description._fields}
     complete = answer["settings"]

@@ -110,5 +110,31 @@ def shares(x: Values, parts: NDArray[np.float64], names: Iterable[str]) -> list[
     return [Band(x, ends[i], ends[i + 1], name, share=True) for i, name in enumerate(names)]
 
 
+def chart_rows(chart: Chart) -> list[dict[str, Any]]:
+    """What a chart draws as rows of a table: a point each, with its panel and its name."""
+    rows = []
+    for number, panel in enumerate(chart.panels, start=1):
+        for item in panel.drawn:
+            if isinstance(item, Spans):
+                columns: dict[str, Any] = {"text": item.names, "x": item.edges[:-1]}
+            elif isinstance(item, Band):
+                columns = {"x": item.x, "low": item.low, "high": item.high}
+            elif isinstance(item, Words):
+                continue  # they name what is drawn
+            else:
+                columns = {"x": item.x, "y": item.y}
+                for key in ("colour", "texts"):
+                    if (values := getattr(item, key, None)) is not None:
+                        columns[key.removesuffix("s")] = values
+            about = {"panel": panel.title or number, "name": item.name}
+            about |= {"x axis": panel.x.label, "y axis": panel.y.label}
+            for values in zip(*columns.values(), strict=True):
+                of_point = about | dict(zip(columns, values, strict=True))
+                rows.append({key: of_point.get(key) for key in _COLUMNS})
+    return rows
+
+
+_COLUMNS = ("panel", "name", "x", "y", "low", "high", "colour", "text", "x axis", "y axis")
+"""Of `chart_rows`."""
 Charts = Iterator[Chart | str | None]
 """Charts of a part of a study; of what is missing, a sentence that says what to run, or None."""

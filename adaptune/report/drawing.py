@@ -23,8 +23,10 @@ from adaptune.report.charts import (
     Spans,
     Values,
     Words,
+    chart_rows,
 )
 from adaptune.report.looks import Look, looks
+from adaptune.report.tables import csv_text
 
 _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
 """A colour map whose lightness rises, without colours too light for a white ground."""
@@ -137,7 +139,7 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
 
 
 def draw_chart(chart: Chart, *files: Path) -> None:
-    """Draw a chart into files; one whose name ends in ``.svg`` is an SVG, others are PNGs."""
+    """Draw a chart into files by their suffix: PNG, SVG, PDF, or CSV with its data."""
     import vl_convert
 
     svg = vl_convert.vegalite_to_svg(spec(chart))
@@ -147,8 +149,12 @@ def draw_chart(chart: Chart, *files: Path) -> None:
         svg = svg.replace(f'"{name}"', f'"id-{i}"').replace(f"#{name})", f"#id-{i})")
     for file in files:
         with replacing(file) as temporary:
-            if file.suffix.lower() == ".svg":
-                temporary.write_text(svg, "utf-8")
+            suffix = file.suffix.lower()
+            if suffix in (".svg", ".csv"):
+                text = svg if suffix == ".svg" else csv_text(chart_rows(chart))
+                temporary.write_text(text, "utf-8")
+            elif suffix == ".pdf":
+                temporary.write_bytes(vl_convert.svg_to_pdf(svg))
             else:
                 temporary.write_bytes(vl_convert.svg_to_png(svg, scale=1.5))
 

@@ -13,8 +13,8 @@ from adaptune.report.charts import Chart
 from adaptune.report.drawing import draw_chart, spec
 from adaptune.report.tables import Listing, cell_text
 
-FIGURES = "figures"
-"""The folder beside a page that holds its charts as PNG and SVG."""
+FIGURES, KINDS = "figures", ("png", "svg", "pdf", "csv")
+"""The folder beside a page that holds its charts, and their kinds of files."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class Page:
 
 
 def write_page(path: Path, page: Page) -> None:
-    """Write a page, and its charts as PNG and SVG into the folder `FIGURES` beside its HTML file.
+    """Write a page, and its charts with their data into the folder `FIGURES` beside its HTML file.
 
     The keys of its charts are distinct and names of files. There is a FullError without room.
     """
     charts = [chart for section in page.sections for chart in section.charts]
     with processes(len(charts), [__name__]) as pool:
         figures = [path.parent / FIGURES / chart.key for chart in charts]
-        files = ([f"{figure}.{kind}" for figure in figures] for kind in ("png", "svg"))
+        files = ([f"{figure}.{kind}" for figure in figures] for kind in KINDS)
         drawn = pool.map(draw_chart, charts, *(map(Path, of_kind) for of_kind in files))
         text = page_text(page)
         list(drawn)  # raises what went wrong
@@ -71,6 +71,7 @@ def page_text(page: Page) -> str:
         page=page,
         css=here.joinpath("page.css").read_text("utf-8"),
         figures=FIGURES,
+        kinds=KINDS,
         charts={c.key: spec(c, titled=False) for part in page.sections for c in part.charts},
         columns=_columns,
         vega=vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;"),

@@ -12,6 +12,7 @@ from adaptune import errors, yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
+    ABSENT,
     ODOMETRIES,
     PROGRAMS,
     declare,
@@ -90,6 +91,7 @@ def _check_odometry(
     if not isinstance(name, str) or not isinstance(settings, dict):
         return  # the models find it
     at_fault = "name"
+    ABSENT.discard(name)
     try:
         # A class of the user is imported in a process of its own.
         where(name) if is_user_class(name) else odometry_class(name)
@@ -109,6 +111,10 @@ def _check_odometry(
     except OdometryError as error:
         key = "name" if isinstance(error, NotInstalledError) else at_fault
         mistakes += [Finding((*at, key), str(error))] * needed
+        # In a study's folder, the parameters are defined with nothing left to the class.
+        ranges = [one for one in (data.get("parameters") or {}).values() if isinstance(one, dict)]
+        if not needed and is_user_class(name) and ranges and all("type" in r for r in ranges):
+            ABSENT.add(name)
 
 
 def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> list[Finding]:
@@ -245,6 +251,9 @@ def _read(path: Path) -> yaml12.Document:
         raise ConfigurationError(str(error)) from error
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
+    if document.data.keys().isdisjoint(("odometry", "sequences", "courses", "training")):
+        what = "is no study, it names no odometry and no recordings"
+        raise ConfigurationError(f"{path}: {what}; a parameter file goes with a bag, as --config")
     return document
 
 

@@ -1,6 +1,7 @@
 """What a user asks to tune: recordings, or folders of them, and an odometry."""
 
 import logging
+import multiprocessing
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -9,12 +10,12 @@ from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from adaptune import processes
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
-    from adaptune.odometry import Odometry
     from adaptune.recording.fleet import Reading
     from adaptune.recording.inspect import Inspection
 
@@ -33,7 +34,7 @@ class Asked(NamedTuple):
     config: Path | None = None  # the user's parameter file
     test: Sequence[Path] = ()
     reading: "Reading | None" = None
-    about: Mapping[str, Any] = {}  # of the odometry: its settings and parameters, if given
+    about: Mapping[str, Any] = {}  # by odometry, its settings and parameters, if given
     trials: int | None = None
     minutes: float | None = None
     budget: float | str | None = None
@@ -85,7 +86,7 @@ def check_no_study(path: Path) -> None:
 def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
     """The recordings by the names of their sequences, and the names of those for the test."""
     from adaptune.recording.config import NO_REFERENCE
-    from adaptune.recording.fleet import check_alike, recordings_at
+    from adaptune.recording.fleet import recordings_at
 
     for path in asked.recordings:
         check_no_study(path)
@@ -109,7 +110,6 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
             f"its own; write a study file, see docs/your-bag.md"
         )
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
-    check_alike(inspections)
     named = by_name(inspections)
     return named, list(named)[len(paths) - len(tested) :]
 
@@ -147,13 +147,29 @@ def usable(path: Path, points: str | None, reference: str | None, show: Progress
     return found
 
 
-def named_odometry(given: "str | type[Odometry] | Odometry") -> tuple[str, dict[str, Any]]:
-    """The name of an odometry in a study, and the settings and parameters of an object.
+def check_guarded(function: str) -> None:
+    """Refuse to begin again in a process that was started by the same script."""
+    started = getattr(sys.modules["__main__"], "__spec__", None)
+    imported = started is not None and started.name == processes.__name__
+    if imported or getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise AdaptuneError(
+            f'call adaptune.{function} below `if __name__ == "__main__":`, because its workers '
+            f"import the script"
+        )
 
-    The class of a script has the name that other processes import it by.
+
+def named_odometry(given: Any) -> tuple[str, dict[str, Any]]:
+    """The names of odometries in a study, and by name the settings and parameters of objects.
+
+    The class of a script has the name that other processes import it by. A list's names are joined
+    with commas.
     """
     if isinstance(given, str):
         return given, {}
+    if isinstance(given, list | tuple) and given:
+        each = [named_odometry(one) for one in given]
+        about = {name: settings for _, of in each for name, settings in of.items()}
+        return ",".join(name for name, _ in each), about
     from adaptune.odometry import Odometry
     from adaptune.odometry.content import module_file
     from adaptune.odometry.registry import ODOMETRIES
@@ -169,11 +185,11 @@ def named_odometry(given: "str | type[Odometry] | Odometry") -> tuple[str, dict[
     if not isinstance(given, Odometry):
         raise AdaptuneError(
             "odometry: give a name, or several with commas; a class derived from "
-            "adaptune.odometry.Odometry; or an object of one"
+            "adaptune.odometry.Odometry; an object of one; or a list of these"
         )
     parameters = {key: {"baseline": value} for key, value in given.parameters.items()}
     settings = given.settings.model_dump(mode="json", exclude_unset=True)
-    return name, {"settings": settings, "parameters": parameters}
+    return name, {name: {"settings": settings, "parameters": parameters}}
 
 
 def odometries_of(given: str, imu: bool) -> list[str]:

@@ -1,11 +1,12 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
 import logging
+import math
 import os
 import shutil
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -14,14 +15,17 @@ from typing import TYPE_CHECKING, Any
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.machine import pin
-from adaptune.progress import Progress
-from adaptune.tuning.asked import Asked, recorded, words_of
+from adaptune.progress import Progress, bars_and_words
+from adaptune.space import in_words
+from adaptune.tuning.asked import Asked, check_guarded, named_odometry, recorded, words_of
 from adaptune.tuning.studies import is_image
 from adaptune.yaml12 import Document, YamlError
 
 if TYPE_CHECKING:
+    from adaptune.odometry import Odometry
+    from adaptune.recording.fleet import Reading
     from offline.config import OfflineStudy
-    from online.gate import Shared, Side
+    from online.gate import Gate, Shared, Side
     from online.turns import Costs
 
 _log = logging.getLogger(__name__)
@@ -35,22 +39,22 @@ Lengths that suit the recordings would change with each that is added, and with 
 
 
 def sides(
-    given: Sequence[str], asked: Asked, length: float | None, show: Progress
+    given: Sequence[Any], asked: Asked, length: float | None, show: Progress
 ) -> "tuple[Side, Side]":
     """The replays of both sides, the new one first; those that are missing are made.
 
-    A side is a study or its folder; or where recordings are `asked` for, a parameter file of the
-    odometry, or an odometry: a name, a command or an image. They are driven by turns, each alone on
-    a core. `length` is that of sub-trajectories; by default the studies', or `CAR` or `ROBOT`.
+    See `compare` for what a side is. They are driven by turns, each alone on a core. `length` is
+    that of sub-trajectories; by default the studies', or `CAR` or `ROBOT`.
     """
     from online.gate import Side
 
-    studies, now = _driven(given, asked, show) if asked.recordings else _studies(given), time.time()
-    _drive(studies, show)
+    called, now = [*map(_called, given)], time.time()
+    studies = _driven(given, asked, show) if asked.recordings else _studies(called)
+    _drive(studies, called, show)
     if length is not None:
         over = {"sub_trajectory": length}
         studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
-    for name, study in zip(given, studies, strict=True):
+    for name, study in zip(called, studies, strict=True):
         made = [path.stat().st_mtime for path in study.folder.glob("replays/*/*/replay.json")]
         if made and (first := min(made)) < now:
             _log.info(
@@ -58,8 +62,78 @@ def sides(
                 f"compared. Libraries and other files that it loads may have changed since; to "
                 f"drive it anew, remove {study.folder / 'replays'}"
             )
-    new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
+    new, old = (Side(name, study) for name, study in zip(called, studies, strict=True))
     return new, old
+
+
+def _called(given: Any) -> str:
+    """A side in words; of an object, with its parameters."""
+    name, about = named_odometry(given)
+    values = {key: of["baseline"] for key, of in about[name]["parameters"].items()} if about else {}
+    return f"{name} ({in_words(values)})" if about else name
+
+
+def compare(
+    new: "str | Path | type[Odometry] | Odometry",
+    old: "str | Path | type[Odometry] | Odometry",
+    recordings: "str | Path | Sequence[str | Path]" = (),
+    *,
+    odometry: str = "",
+    points: str | None = None,
+    reference: str | Path | None = None,
+    reading: "Reading | None" = None,
+    sub_trajectory: float | None = None,
+    worse: float = 5.0,
+    cost: float | None = 10.0,
+    progress: Progress | None = None,
+) -> "Gate":
+    """Say whether an odometry is worse than another, as ``compare NEW --against OLD`` does.
+
+    The result's `verdict` is ``"worse"``, ``"equal"``, ``"better"`` or ``"unclear"``, its `words`
+    say why, and its `rows` have each quantity on each recording. In a script, call it below
+    ``if __name__ == "__main__":``. There is an AdaptuneError where the two do not compare.
+
+    Parameters
+    ----------
+    new, old
+        Studies or their folders, whose replays are there; or where `recordings` are given, what
+        to drive: names of odometries, classes, objects with their parameters, commands, images,
+        or parameter files of an `odometry`.
+    recordings
+        Bags, or folders of them; `reading`, ``"one"`` or ``"several"``, says how to read these.
+    points, reference
+        Topics, where not the recording's own; or a reference's file, or ``"estimated"``.
+    sub_trajectory
+        Metres over which errors are measured; by default the studies', or 2 m, of cars 10 m.
+    worse, cost
+        Percent of error and of CPU time that are no matter; with None, no cost is.
+    progress
+        Called with how far each task is; by default, bars show it.
+    """
+    check_guarded("compare")
+    bags = [recordings] if isinstance(recordings, str | Path) else recordings
+    judge = None if reference is None else str(reference)
+    asked = Asked([*map(Path, bags)], odometry, points, judge, reading=reading)
+    given = [str(side) if isinstance(side, Path) else side for side in (new, old)]
+    with ExitStack() as stack:
+        show = progress or stack.enter_context(bars_and_words())
+        return gated(given, asked, (worse, cost), sub_trajectory, show)
+
+
+def gated(
+    given: Sequence[Any],
+    asked: Asked,
+    percents: tuple[float, float | None],
+    length: float | None,
+    show: Progress,
+) -> "Gate":
+    """Do what `compare` does of what was asked; `percents` are of error and of cost."""
+    from online.gate import compare_sides, shared_replays
+
+    shared = shared_replays(*sides(given, asked, length, show))
+    error, cost = percents
+    measured = None if cost is None else costs(shared, show)
+    return compare_sides(shared, measured, error / 100.0, math.inf if cost is None else cost / 100)
 
 
 def costs(shared: "Shared", show: Progress) -> "dict[str, Costs | str]":
@@ -92,7 +166,7 @@ def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
     return [load_study(name, needed=Path(name).is_file()) for name in given]
 
 
-def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[OfflineStudy]":
+def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> "list[OfflineStudy]":
     """Both sides as studies of the same recordings."""
     from adaptune.manifest import digest
     from adaptune.reference.check import greatest_speed
@@ -105,8 +179,11 @@ def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[Offline
         "sequences": {name: one.given for name, one in named.items()},
         "training": names,
     }
-    entries = [_entry(name, asked.odometry) for name in given]
-    folders = [FOLDER / f"{plain_name(Path(name))[:40]}_{digest(name)[:6]}" for name in given]
+    entries = [_entry(side, asked.odometry) for side in given]
+    folders = []
+    for side, entry in zip(given, entries, strict=True):
+        about = side if isinstance(side, str) else entry
+        folders.append(FOLDER / f"{plain_name(Path(_called(side)))[:40]}_{digest(about)[:6]}")
     first = load_study(shared | {"odometry": entries[0]}, folder=folders[0])
     first.open()
     refused = ensure_references(first.sequences, names, 5.0, show, required=False)
@@ -119,10 +196,14 @@ def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[Offline
     return [load_study(shared | {"odometry": of}, folder=folder) for of, folder in both]
 
 
-def _entry(given: str, odometry: str) -> dict[str, Any]:
+def _entry(given: Any, odometry: str) -> dict[str, Any]:
+    from adaptune.manifest import plain
     from adaptune.odometry.base import ToolSettings
     from adaptune.odometry.registry import is_user_class, odometry_class
 
+    if not isinstance(given, str):
+        name, about = named_odometry(given)
+        return {"name": name, **plain(about.get(name, {}))}
     file = Path(given)
     if len(words_of(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
         return _named(given)
@@ -158,7 +239,7 @@ def _named(given: str) -> dict[str, Any]:
     return {"name": given}
 
 
-def _drive(studies: "Sequence[OfflineStudy]", show: Progress) -> None:
+def _drive(studies: "Sequence[OfflineStudy]", called: Sequence[str], show: Progress) -> None:
     """Make the replays of the baselines that are missing, of a study that is a file.
 
     Both sides take turns on each recording, so that both meet the same state of the machine.
@@ -166,10 +247,16 @@ def _drive(studies: "Sequence[OfflineStudy]", show: Progress) -> None:
     from online.modes import BASELINE, replay_modes, sequences_without_model
 
     due = [
-        (name, study)
-        for study in studies
+        (name, side, study)
+        for side, study in zip(called, studies, strict=True)
         if not list((study.folder / "replays").glob("*/fixed/replay.json"))
         for name in sequences_without_model(study.config)
     ]
-    for name, study in sorted(due, key=lambda one: one[0]):
-        replay_modes(study, [name], (BASELINE,), show)
+    for name, side, study in sorted(due, key=lambda one: one[0]):
+        # Of the same text, the second one would not be shown.
+        texts = {f"{name}, {BASELINE}": f"{name}, {side}"}
+
+        def shown(text: str, *how: Any, texts: dict[str, str] = texts) -> None:
+            show(texts.get(text, text), *how)
+
+        replay_modes(study, [name], (BASELINE,), shown)

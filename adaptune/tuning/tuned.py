@@ -2,19 +2,16 @@
 
 import base64
 import logging
-import multiprocessing
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adaptune import processes
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.progress import Progress, bars_and_words
-from adaptune.tuning.asked import Asked, named_odometry
+from adaptune.tuning.asked import Asked, check_guarded, named_odometry
 from adaptune.tuning.studies import written
 
 if TYPE_CHECKING:
@@ -24,6 +21,8 @@ if TYPE_CHECKING:
     from offline.config import OfflineStudy
     from offline.train import Training
     from online.compare import ComparedReplays
+
+    One = str | type[Odometry] | Odometry
 
 _log = logging.getLogger(__name__)
 Paths = str | Path | Sequence[str | Path]
@@ -71,10 +70,17 @@ class Tuned:
 
     @property
     def errors(self) -> Any:
-        """Errors by frame in training, a column for each set, with descriptors and folds."""
+        """Errors by frame in training, a column for each set, with time, place and descriptors.
+
+        The `attrs` of the data frame have each column's parameters.
+        """
         from offline.scenario import scenario
 
-        return _table(scenario(self.study).columns())
+        found = scenario(self.study)
+        table = _table(found.columns())
+        if hasattr(table, "attrs"):
+            table.attrs |= {f"rte_{trial}": found.sets[trial] for trial in found.sets}
+        return table
 
     @property
     def modes(self) -> Any:
@@ -150,12 +156,12 @@ def _table(rows: Any) -> Any:
         import pandas as pd
     except ImportError:
         return rows
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).rename(columns=lambda name: name.lstrip("_"))
 
 
 def tune(
     recordings: Paths,
-    odometry: "str | type[Odometry] | Odometry | None" = None,
+    odometry: "One | Sequence[One] | None" = None,
     *,
     config: str | Path | None = None,
     test: Paths = (),
@@ -180,8 +186,9 @@ def tune(
     recordings
         Bags, or folders of them; `reading`, ``"one"`` or ``"several"``, says how to read these.
     odometry
-        A name, as ``"kiss_icp"`` or ``"my_module:MyIcp"``; such a class; or an object of it, whose
-        parameters are the baseline. By default ``"gicp"``, with a `config` ``"kiss_icp"``.
+        A name, as ``"kiss_icp"`` or ``"my_module:MyIcp"``; such a class; an object of it, whose
+        parameters are the baseline, as ``MyIcp(voxel=0.5)``; or a list of these. By default
+        ``"gicp"``, with a `config` ``"kiss_icp"``.
     config
         The user's parameter file: the baseline, and all that is not tuned.
     test
@@ -227,13 +234,7 @@ def tune_asked(
     from offline.train import train
     from online.modes import run_replays
 
-    started = getattr(sys.modules["__main__"], "__spec__", None)
-    imported = started is not None and started.name == processes.__name__
-    if imported or getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise AdaptuneError(
-            'call adaptune.tune below `if __name__ == "__main__":`, because its workers import the '
-            "script"
-        )
+    check_guarded("tune")
     forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.paired import Pair, interval_of_mean, pooled, ratio
+from adaptune.paired import Pair, in_cell, interval_of_mean, pooled, ratio
 
 BLOCK = 10
 seeds = st.integers(0, 2**32 - 1)
@@ -106,6 +106,11 @@ def test_the_parts_of_one_recording_are_one():
     many = [p._replace(recording=str(i)) for i, p in enumerate(short) for _ in range(6)]
     once = ratio([p._replace(recording=str(i)) for i, p in enumerate(short)])
     assert ratio(many).error == pytest.approx(once.error)
+
+
+def test_a_table_says_where_an_interval_is_none():
+    said = [in_cell(ends) for ends in (None, (0.5, 1.25), (0.0, math.inf), (1.0, 1.0))]
+    assert said == ["too few", "0.50-1.25", "too few", "the same"]
 
 
 def test_less_than_two_blocks_say_nothing_of_how_sure_it_is():

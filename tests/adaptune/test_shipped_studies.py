@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rec
+from drives import FIRST_STAMP, cloud
 from needs import needs_evalio
 
 from adaptune import yaml12
@@ -16,7 +19,9 @@ IMAGES = ("faster_lio_botanic_garden", "fast_livo2_botanic_garden", "lego_loam_k
 THIRD_PARTY = sorted(path.stem for path in CONFIGS.glob("third_party_*.yaml"))
 
 
-@pytest.mark.parametrize("name", [*IMAGES, "suma_kitti", "botanic_garden_gicp", "kitti_gicp"])
+@pytest.mark.parametrize(
+    "name", [*IMAGES, "suma_kitti", "botanic_garden_gicp", "botanic_garden_evening", "kitti_gicp"]
+)
 def test_shipped_studies_lack_nothing_but_their_data(name, monkeypatch, tmp_path):
     monkeypatch.setattr(rustle, "image_digest", lambda _: "as if it were here")
     program = tmp_path / "suma_kitti"
@@ -28,6 +33,31 @@ def test_shipped_studies_lack_nothing_but_their_data(name, monkeypatch, tmp_path
     with pytest.raises(ConfigurationError) as caught:
         load_study(CONFIGS / f"{name}.yaml")
     assert all("there is no such" in line for line in str(caught.value).splitlines())
+
+
+def test_the_study_of_an_evening_splits_its_recording(monkeypatch, tmp_path):
+    messages = []
+    for i in range(200):
+        stamp = FIRST_STAMP + i * 100_000_000
+        points = np.full((50, 3), 1.0 + 0.01 * i, np.float32)
+        messages.append(("/velodyne_points", stamp, cloud(stamp, points)))
+        pose = rec.pose(stamp, (0.1 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), rec.ROS1)
+        messages.append(("/gt_poses", stamp, pose))
+    rec.write_bag(tmp_path / "1018_00.bag", messages)
+    monkeypatch.setenv("BOTANIC_GARDEN", str(tmp_path))
+    study = load_study(CONFIGS / "botanic_garden_evening.yaml", folder=tmp_path)
+    assert study.config.training == ("1018_00_0-60",)
+    assert study.config.test == ("1018_00_60-100",)
+    n = {name: len(list(study.sequences.open(name))) for name in ("1018_00_0-60", "1018_00_60-100")}
+    assert n == {"1018_00_0-60": 120, "1018_00_60-100": 80}
+
+
+def test_templates_of_parameters_are_no_studies():
+    for path in (CONFIGS / "templates").iterdir():
+        with pytest.raises(ConfigurationError, match=r"is no study, .* as --config"):
+            load_study(path)
+    for path in CONFIGS.glob("*.yaml"):
+        assert "odometry" in yaml12.Document.of_file(path).data
 
 
 @pytest.mark.parametrize("name", IMAGES)

@@ -8,6 +8,7 @@ from labelled_places import SETS, TRIALS, labelled, two_kinds, with_motions
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import NOTHING, Rule
+from adaptune.paired import MIN_BLOCKS
 from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
@@ -98,10 +99,9 @@ def test_validates_a_study(study_file, trained_folder, tmp_path):
     ends = ["cost [ms]", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
     assert rows[0]["adaptive"] == pytest.approx(validation.ratios["adaptive"][0])
-    # Four sub-trajectories tell nothing; a dozen would.
-    assert rows[0]["adaptive, 95 %"] is None
-    summary = validation.summary("adaptive")
-    assert rows[3]["adaptive, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    # Four sub-trajectories tell nothing, nor do two stretches; a dozen would.
+    assert len(validation.recordings) < MIN_BLOCKS
+    assert [rows[i]["adaptive, 95 %"] for i in (0, 3, 4)] == ["too few", "too few", None]
     assert validation.left_out[0].span > 1
     for name in ("validation.csv", "validation.svg", "stretches.csv"):
         assert (study.folder / name).exists()
@@ -207,3 +207,7 @@ def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better)
     said = baseline_in_words(Validation(left_out))
     assert " times the error of the sets that are chosen without what is left out, over 2 " in said
     assert said.endswith("): there the baseline is better.") == better
+    for one in left_out:
+        one.errors["baseline"] = one.errors["fixed"]
+    said = baseline_in_words(Validation(left_out))
+    assert said == "Without what is left out, the baseline is chosen each time, over 2 stretches."

@@ -78,6 +78,8 @@ def test_sets_are_of_the_space_and_differ(config):
         SPACE.check(parameters)
         types = [type(value) for value in parameters.values()]
         assert types[:4] == [float, float, int, int]
+        if config.sampler_settings.get("grid") is None:
+            assert all(value == float(f"{value:.4g}") for value in [*parameters.values()][:2])
         assert list(parameters) == list(SPACE.names)
 
 

@@ -1,13 +1,15 @@
 import json
+import shutil
 import sys
 
+import fake_odometry
 import numpy as np
 import pytest
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
-from adaptune.model import Rule
+from adaptune.model import ErrorModel, Rule
 from adaptune.model.knn import NearestNeighbours
 from adaptune.model.rules import BASELINE
 from adaptune.space import Selection
@@ -69,6 +71,12 @@ class Cheapest(Baseline):
         return Selection(best, self.data.sets[best])
 
 
+class Outside(Baseline):
+    def select(self, feature, live=None):  # noqa: ARG002
+        other = next(trial for trial in self.data.sets if trial not in self.data.candidates)
+        return Selection(other, self.data.sets[other])
+
+
 class Best(Baseline):
     """Sees the error of the very frame, which no fold that is left out may show."""
 
@@ -77,16 +85,49 @@ class Best(Baseline):
         return Selection(self.data.sets.trials[frame], self.data.sets[0])
 
 
+def errors(found, rule):
+    return cap(found.performances)[np.arange(42), found.select(rule)]
+
+
+def test_a_table_of_rules_has_what_they_compare_with(study):
+    found = scenario(study)
+    rows = {row["rule"]: row for row in found.score(Baseline(), Fixed())}
+    assert list(rows) == ["Baseline", "Fixed", "fixed", "best single set", "oracle"]
+    some = [found.sets.column(trial) for trial in found.candidates]
+    capped = cap(found.performances)[:, some]
+    assert rows["oracle"]["RTE [%]"] == pytest.approx(capped.min(axis=1).mean())
+    assert rows["best single set"]["RTE [%]"] == pytest.approx(capped.mean(axis=0).min())
+    assert rows["Fixed"] | {"rule": "fixed"} == rows["fixed"]
+    assert rows["fixed"]["vs fixed"] == 1.0
+    assert rows["Baseline"]["cost [ms]"] == pytest.approx(found.cost[0])
+    assert rows["Baseline"]["RTE [%]"] == pytest.approx(errors(found, Baseline()).mean())
+
+
+def test_candidates_are_those_of_online(study, monkeypatch):
+    model = ErrorModel.load(study.model_path)
+    assert scenario(study).candidates == tuple(model.allowed() or model.sets)
+    # An odometry that cannot change live has a bank.
+    monkeypatch.setattr(type(study.odometry.description), "live", False, raising=False)
+    found = scenario(study)
+    members = {model.fixed, *model.bank} - ({*model.reserve} - {model.fixed})
+    assert set(found.candidates) == members
+    assert np.isin(found.select(Cheapest()), [found.sets.column(n) for n in members]).all()
+    with pytest.raises(AdaptuneError, match=r"Outside: selects trial \d+, which is none of data"):
+        found.select(Outside())
+
+
 def test_rules_are_scored_without_an_odometry(study):
     found = scenario(study)
-    baseline, fixed = found.score(Baseline()), found.score(Fixed())
+    baseline, fixed = errors(found, Baseline()), errors(found, Fixed())
     np.testing.assert_array_equal(baseline, found.performances[:, 0])
     assert not np.array_equal(fixed, baseline)
-    cheapest = found.score(Cheapest())
-    np.testing.assert_array_equal(cheapest, cap(found.performances)[:, found.cost.argmin()])
+    cheapest = errors(found, Cheapest())
+    some = [found.sets.column(trial) for trial in found.candidates]
+    least = some[int(found.cost[some].argmin())]
+    np.testing.assert_array_equal(cheapest, cap(found.performances)[:, least])
     with pytest.raises(AdaptuneError, match=r"Cheapest: is a class; give an object, Cheapest\(\)"):
         found.score(Cheapest)
-    near = found.score(NearestNeighbours(k=3))
+    near = errors(found, NearestNeighbours(k=3))
     assert near.shape == (42,)
     assert np.isin(near, cap(found.performances)).all()
     with pytest.raises(AdaptuneError, match=r"Best\.select: ValueError: not enough values"):
@@ -144,6 +185,19 @@ def test_columns_are_found_by_their_names(study, tmp_path):
     about["sets"] = [dict(reversed(one.items())) for one in about["sets"]]
     (tmp_path / "a_sets.json").write_text(json.dumps(about))
     same(read_scenario(tmp_path / "a.csv"), found)
+
+
+def test_it_is_read_without_the_class_of_the_odometry(study, tmp_path):
+    folder = shutil.copytree(study.folder, tmp_path / "study")
+    text = (folder / "study.yaml").read_text()
+    assert fake_odometry.NAME in text
+    (folder / "study.yaml").write_text(text.replace(fake_odometry.NAME, "gone:Fake"))
+    with pytest.raises(AdaptuneError, match="cannot import gone"):
+        load_study(folder)
+    found = scenario(load_study(folder, needed=False))
+    np.testing.assert_array_equal(found.performances, scenario(study).performances)
+    with pytest.raises(AdaptuneError, match="cannot import gone"):
+        load_study(folder)
 
 
 def test_mistakes_are_told(study, study_file, tmp_path, monkeypatch):

@@ -41,8 +41,8 @@ def test_errors_of_a_recorded_pair_are_those_of_evo_and_kitti(recorded):
     assert cells["[deg/100 m]"] == pytest.approx(0.1887, abs=1e-4)
     assert cells["over [m]"] == "100-800"
     files = row("00", found).columns()
-    assert files["_kitti_lengths_m"] == "100 200 300 400 500 600 700 800"
-    assert files["_kitti_deg_per_m"] == found.kitti.rotation
+    assert files["kitti_lengths_m"] == "100 200 300 400 500 600 700 800"
+    assert files["kitti_deg_per_m"] == found.kitti.rotation
 
 
 @pytest.mark.parametrize(("metres", "lengths"), [(99, None), (150, "100"), (250, "100-200")])

@@ -1,4 +1,4 @@
-"""Selection rules as a user may write them; the first is that of docs/validate-and-compare.md."""
+"""Selection rules as a user may write them."""
 
 from adaptune.model import Rule
 from adaptune.model.rules import NOTHING

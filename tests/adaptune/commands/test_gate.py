@@ -11,7 +11,9 @@ from xml.etree import ElementTree as Xml
 import commands
 import drives
 import pytest
+from fake_odometry import Fake
 
+import adaptune
 from adaptune import manifest
 from adaptune.odometry.tracker import Tracker
 from online.gate import judged
@@ -65,6 +67,30 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     assert data["action"] == "pass"
     rows = data["rows"]
     assert {row["ratio"] for row in rows if row["quantity"] == "error"} == {1.0}
+
+
+@pytest.mark.services
+def test_in_python_sides_may_be_objects():
+    good, bad = Fake(keyframe_interval=1.0), Fake(keyframe_interval=30.0)
+    gate = adaptune.compare(bad, good, ["drive_a.bag", Path("drive_b.bag")], cost=None)
+    assert gate.verdict == "worse"
+    assert "fake_odometry:Fake (max_correspondence_distance 4, keyframe_interval 30)" in gate.words
+    assert adaptune.compare(good, good, "drive_a.bag", cost=None).verdict == "equal"
+
+
+@pytest.mark.services
+def test_recordings_of_several_sensors_compare_and_each_side_is_named_while_it_drives(bags):
+    made = drives.scans(5, 60)
+    slow = [(stamp + 400_000_000 * i, points, T) for i, (stamp, points, T) in enumerate(made)]
+    drives.write_bag(bags / "slow.bag", slow)
+    told = []
+    both = ["drive_a.bag", "slow.bag"]
+    sides = Fake(keyframe_interval=2.0), Fake(keyframe_interval=3.0)
+    gate = adaptune.compare(*sides, both, cost=None, progress=lambda *how: told.append(how[0]))
+    assert {row.recording for row in gate.rows} == {"drive_a", "slow", "all"}
+    for name in ("drive_a", "slow"):
+        driving = {text for text in told if text.startswith(f"{name}, fake")}
+        assert {text[-3:-1] for text in driving} == {" 2", " 3"}
 
 
 @pytest.mark.services

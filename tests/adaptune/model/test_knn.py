@@ -94,6 +94,27 @@ def counts(seed, n=60):
     return rng.poisson(rng.dirichlet(np.ones(4), n) @ places).astype(float)
 
 
+def test_the_published_rule_by_hand():
+    """Koide et al. (IROS 2021): the mean of the five nearest of 48 pairs, and the least of these.
+
+    Frames lie at 0, 1, ..., 11; sets at 0, 1, 2 and 3 times 0.894, so that they deviate by 1.
+    From a scan at 4.3, frame 4 is away by 0.3, frame 5 by 0.7, and frame 3 by 1.3; with the set
+    beside it, frame 4 by 0.94 and frame 5 by 1.14.
+    """
+    errors = np.array([[1 + frame, 4, 3, 3 + 0.5 * frame] for frame in range(12)], np.float32)
+    sets, frames = table(np.arange(4.0)[:, None] / 3.0), np.arange(12.0)[:, None]
+    rule = NearestNeighbours().fit(TrainingData(frames, np.zeros(12, int), errors, sets, 0))
+    by_hand = [
+        (5 + 6 + 4 + 4 + 4) / 5,  # frame and set: (4, 0), (5, 0), (4, 1), (5, 1), (3, 0)
+        (4 + 4 + 5 + 3 + 6) / 5,  # (4, 1), (5, 1), (4, 0), (4, 2), (5, 0): of equal ones the first
+        (3 + 3 + 4 + 5 + 4) / 5,  # (4, 2), (5, 2), (4, 1), (4, 3), (5, 1)
+        (5 + 5.5 + 3 + 3 + 4.5) / 5,  # (4, 3), (5, 3), (4, 2), (5, 2), (3, 3)
+    ]
+    np.testing.assert_allclose(rule.predict(np.array([4.3])), by_hand, rtol=1e-6)
+    found = rule.select(np.array([4.3]))
+    assert (found.trial, found.predicted_error) == (2, pytest.approx(3.8))
+
+
 def test_components_are_those_of_sklearn_divided_by_one_number():
     X = counts(0)
     scaled = ScaledPCA([90]).fit(X)

@@ -1,14 +1,27 @@
 """Each kind of item is drawn, and read back from the SVG."""
 
+import csv
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from sample_charts import comparison, empty, from_above, over_time, samples, trials
 
-from adaptune.report.charts import Axis, Band, Chart, Line, Panel, Points, Spans, Words, shares
+from adaptune.report.charts import (
+    Axis,
+    Band,
+    Chart,
+    Line,
+    Panel,
+    Points,
+    Spans,
+    Words,
+    chart_rows,
+    shares,
+)
 from adaptune.report.drawing import draw_chart, spec, thinned
 from adaptune.report.looks import MODES, looks
+from adaptune.report.tables import csv_text
 
 
 def drawn(chart, folder):
@@ -17,6 +30,21 @@ def drawn(chart, folder):
     text = (folder / "chart.svg").read_text("utf-8")
     root = ElementTree.fromstring(text)
     return [" ".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")], text
+
+
+def test_data_of_a_chart_are_a_table_and_it_is_drawn_as_pdf(tmp_path):
+    chart = from_above()
+    draw_chart(chart, tmp_path / "chart.pdf", tmp_path / "chart.csv")
+    assert (tmp_path / "chart.pdf").read_bytes().startswith(b"%PDF")
+    with (tmp_path / "chart.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for item in chart.panels[0].drawn:
+        mine = [row for row in rows if row["name"] == item.name]
+        if isinstance(item, Line):
+            assert [float(row["x"]) for row in mine] == pytest.approx(list(item.x), nan_ok=True)
+            assert [float(row["y"]) for row in mine] == pytest.approx(list(item.y), nan_ok=True)
+    for other in samples():
+        assert csv_text(chart_rows(other)).startswith("panel,name,x,y,low,high,")
 
 
 def chart_of(*items, **panel):

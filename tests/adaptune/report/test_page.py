@@ -55,7 +55,9 @@ def test_everything_lies_in_the_page(seen):
     for attribute in ("src", "srcset", "href"):
         for tag, attrs in seen.tags:
             if attribute in attrs:
-                assert re.match(r"#|data:,$|figures/[a-z-]+\.(png|svg)$", attrs[attribute]), tag
+                assert re.match(
+                    r"#|data:,$|figures/[a-z-]+\.(png|svg|pdf|csv)$", attrs[attribute]
+                ), tag
     (policy,) = [m["content"] for m in seen.of("meta") if "http-equiv" in m]
     assert policy.startswith("default-src 'none'")
 
@@ -92,9 +94,9 @@ def test_charts_lie_beside_the_page_as_files(tmp_path):
     path = tmp_path / "index.html"
     write_page(path, Page("A", "", (), (PageSection("B", charts=charts),)))
     links = [a["href"] for a in Seen(path.read_text("utf-8")).of("a")]
-    files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*.*g")}
+    files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("figures/*")}
     assert files == {link for link in links if link.startswith("figures/")}
-    assert len(files) == 2 * len(charts)
+    assert len(files) == 4 * len(charts)
 
 
 @pytest.fixture(scope="module")

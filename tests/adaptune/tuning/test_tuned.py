@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import adaptune
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.progress import bars_and_words
 from adaptune.tuning.asked import Asked, named_odometry
@@ -26,10 +26,14 @@ def folder(tmp_path, monkeypatch):
 def test_an_odometry_is_a_name_a_class_or_an_object(monkeypatch, tmp_path):
     assert named_odometry("mine:Icp") == ("mine:Icp", {})
     assert named_odometry(KeyframeGicp) == ("gicp", {})
-    name, about = named_odometry(fake_odometry.Fake({"keyframe_interval": 3.0}))
-    assert name == fake_odometry.NAME
-    assert about["settings"] == {}
-    assert about["parameters"]["keyframe_interval"] == {"baseline": 3.0}
+    several = ["kiss_icp", KeyframeGicp, fake_odometry.Fake(keyframe_interval=3.0)]
+    names, about = named_odometry(several)
+    assert names == f"kiss_icp,gicp,{fake_odometry.NAME}"
+    (own,) = (about.pop(fake_odometry.NAME), *about)
+    assert own["settings"] == {}
+    assert own["parameters"]["keyframe_interval"] == {"baseline": 3.0}
+    with pytest.raises(OdometryError, match="has no parameter 'keyframe_intervall': did you mean"):
+        fake_odometry.Fake(keyframe_intervall=3.0)
 
     # A script's own class is imported by the script's name; a session has none.
     class Own(fake_odometry.Fake):
@@ -78,6 +82,22 @@ def test_a_session_without_logging_sees_what_is_logged(capsys, monkeypatch):
     assert "later" not in said
 
 
+def test_a_notebook_stores_no_bars(capsys, monkeypatch):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as the kernel does
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with bars_and_words() as show:
+        for i in range(9):
+            now[0] = 1.5 * i
+            show(f"brief {i}", 1, 2)
+            show("runs", i, 9)
+        logging.getLogger("offline.train").info("done")
+    said = capsys.readouterr().err
+    assert "\x1b" not in said
+    assert (said.count("runs:"), said.count("brief"), said.count("done")) == (2, 0, 1)
+
+
 def test_numbers_may_be_those_of_numpy():
     about = {"parameters": {"n": {"baseline": np.int64(3)}}}
     asked = Asked([Path("a.bag")], about=about, budget=np.float64(5.0))
@@ -85,7 +105,7 @@ def test_numbers_may_be_those_of_numpy():
     assert asked.inputs["the odometry's object"] == {"parameters": {"n": {"baseline": 3}}}
 
 
-@pytest.mark.parametrize("given", [lambda: None, ["gicp", "kiss_icp"], None])
+@pytest.mark.parametrize("given", [lambda: None, ["gicp", 3], [], None])
 def test_what_is_no_odometry_is_refused(given):
     with pytest.raises(AdaptuneError, match="odometry: give a name, or several with commas"):
         named_odometry(given)
@@ -123,6 +143,8 @@ def test_a_study_of_which_nobody_knows_how_it_was_made_is_kept():
     assert path.read_text() == "odometry: gicp\n"
 
 
-def test_the_package_has_no_other_names():
+def test_the_package_has_these_names():
+    assert {"tune", "compare"} < set(dir(adaptune))
+    assert all(getattr(adaptune, name) for name in dir(adaptune))
     with pytest.raises(AttributeError, match="has no attribute 'tuna'"):
         _ = adaptune.tuna
