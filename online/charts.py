@@ -153,7 +153,8 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
         tuple(panels),
         "Parameters of each mode over time; of a bank, the shares of its members in the weighted "
         "mean. Names above are the scenes of the course, if it is a simulated one: what is applied "
-        "should change with them.",
+        "should change with them. What no mode changes is not drawn."
+        + "".join(f" {name.capitalize()}: {of}." for name, of in replayed.members.items()),
         shared_x=True,
     )
 
@@ -162,6 +163,8 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
     single = {mode: track for mode, track in replayed.modes.items() if not track.weights}
     for name in dict.fromkeys(name for track in single.values() for name in track.choices):
         chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
+        if all(len({*map(repr, values)}) < 2 for values in chosen.values()):
+            continue
         every = [value for values in chosen.values() for value in values]
         is_named = any(isinstance(value, str) for value in every)
         names = tuple(sorted({_name(value) for value in every} - {""})) if is_named else None

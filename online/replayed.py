@@ -1,7 +1,7 @@
 """The replays of a sequence in all modes that there are, as charts need them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
 from adaptune.reference.judge import Reference
 from adaptune.report.charts import Spans
-from adaptune.space import ParameterSpace
+from adaptune.space import ParameterSpace, in_words
 from adaptune.study.driven import named
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
@@ -85,6 +85,8 @@ class ReplayedSequence:
     scenes: Spans | None = None  # of a simulated course
     estimated: bool = False  # whether the reference was computed from the recording
     refused: Sequence[str] = ()  # sentences about replays that are not among them
+    # of banks by name, their sets in words
+    members: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_replays(study: Study, name: str) -> ReplayedSequence:
@@ -107,7 +109,13 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     if replays:
         stamps = next(iter(replays.values())).trajectory.stamps
         scenes = scenes_along(study.sequences, name, stamps)
-    about = study.odometry.space, scenes, reference.estimated, current.refused
+    members = {
+        _member(replay, model, number): in_words(model.sets[number])
+        for replay in replays.values()
+        for number in replay.weights
+        if (model := current.model) is not None and number in model.sets
+    }
+    about = study.odometry.space, scenes, reference.estimated, current.refused, members
     return ReplayedSequence(name, reference.length, modes, *about)
 
 

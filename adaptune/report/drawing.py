@@ -426,7 +426,8 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     """The legend above the panels, of a view that shows nothing else: a symbol of each name."""
     items = [item for panel in chart.panels for item in panel.drawn]
     written = {word for item in items if isinstance(item, Words) for word in item.words}
-    seen = (item for item in sorted(items, key=_layer) if not isinstance(item, Words))
+    seen = [item for item in sorted(items, key=_layer) if not isinstance(item, Words)]
+    seen.sort(key=lambda item: isinstance(item, Band) and item.share)  # a share hides its line
     symbols = {item.name: _symbol(item, every[item.name]) for item in seen if item.name}
     names = [name for name in every if name in symbols and name not in written]
     if not names or all(map(_is_empty, chart.panels)):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
@@ -63,6 +65,16 @@ def test_choices_last_until_the_next_one():
     assert [one.name for one in shares] == ["trial 4", "trial 17", "trial 2"]
     # Shares hide what is shaded: a line shows where a scene ends.
     assert [line.x for line in of_kind(weights, Line)] == [[8.0, 8.0]]
+
+
+def test_what_no_mode_changes_is_not_drawn_and_members_are_told():
+    some = replace(sequence(fixed=kept(), adaptive=bank()), members={"trial 4": "voxel 0.2"})
+    chart = choice_chart(some)
+    assert [panel.title for panel in chart.panels] == [
+        "adaptive applies a bank: weights of its members"
+    ]
+    assert "Trial 4: voxel 0.2." in chart.caption
+    assert choice_chart(sequence(fixed=kept())) is None
 
 
 def test_weights_that_never_change_are_not_drawn():

@@ -97,7 +97,7 @@ def counts(seed, n=60):
 def test_the_published_rule_by_hand():
     """Koide et al. (IROS 2021): the mean of the five nearest of 48 pairs, and the least of these.
 
-    Frames lie at 0, 1, ..., 11; sets at 0, 1, 2 and 3 times 0.894, so that they deviate by 1.
+    Frames lie at 0, 1, ..., 11; sets at 0, 1, 2 and 3 times 0.894: their deviation is 1.
     From a scan at 4.3, frame 4 is away by 0.3, frame 5 by 0.7, and frame 3 by 1.3; with the set
     beside it, frame 4 by 0.94 and frame 5 by 1.14.
     """

@@ -47,6 +47,14 @@ def test_data_of_a_chart_are_a_table_and_it_is_drawn_as_pdf(tmp_path):
         assert csv_text(chart_rows(other)).startswith("panel,name,x,y,low,high,")
 
 
+def test_a_share_that_is_a_line_elsewhere_has_its_square_in_the_legend():
+    x, y = np.arange(3.0), np.ones((1, 3))
+    line = Panel(Axis("x"), Axis("y"), (Line(x, x, "fixed", dashed=True),))
+    share = Panel(Axis("x"), Axis("y"), tuple(shares(x, y, ["fixed"])))
+    legend = spec(Chart("a", "A", (line, share)))["vconcat"][0]
+    assert legend["encoding"]["shape"]["scale"]["range"] == ("square",)
+
+
 def chart_of(*items, **panel):
     axes = {"x": Axis("x [m]"), "y": Axis("y [m]")} | panel
     return Chart("one", "A chart", (Panel(drawn=items, **axes),))
