@@ -70,10 +70,10 @@ def _trial(
     if len(faults) >= MOST_FAULTS:
         failure = f"{len(faults)} faults"
     used = _used(drives, seconds)
-    if any(drive.too_slow for drive in drives):
+    if slow := any(drive.too_slow for drive in drives):
         failure = f"too slow: {used[REGISTER_MS]:.0f} ms a scan"
-    # What goes on without poses may seem to do well.
-    unseen = ~tried | ((without_pose | waiting) & bool(failure))
+    # What goes on without poses may seem to do well; where a slow set is stopped is chance.
+    unseen = ~tried | slow | ((without_pose | waiting) & bool(failure))
     errors = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, config.sub_trajectory, unseen)
     if np.isnan(errors).all():
         failure = failure or "no sub-trajectory has poses"

@@ -4,9 +4,12 @@ import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from adaptune.errors import AdaptuneError
 from adaptune.manifest import differences, merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
@@ -19,6 +22,7 @@ from adaptune.recording.config import (
 )
 from adaptune.recording.export import Layout
 from adaptune.recording.recording import (
+    RecordedSequence,
     SequenceFiles,
     open_sequence,
     sequence_files,
@@ -41,8 +45,14 @@ _AS_ESTIMATED = {
 }
 """Values of these keys where the poses are the LiDAR's own, estimated at its scans."""
 
+_WHOLE = {"start": 0.0, "stop": None, "part": None}
+"""Values of the keys that cut a recording."""
 _inputs: dict[tuple[str, str], ProgramInput] = {}
 """What programs read, by folder and everything that it depends on."""
+
+
+def _source_of(config: SequenceConfig) -> str:
+    return str(next(path for key in SOURCES if (path := getattr(config, key)) is not None))
 
 
 @dataclass(frozen=True)
@@ -113,9 +123,20 @@ class StudySequences:
         return [name for name in names if name in every and every[name].reference == NO_REFERENCE]
 
     def recorded_in(self, name: str) -> str:
-        """What a sequence was recorded in: parts of a recording share it."""
-        config = self.config(name)
-        return str(next(path for key in SOURCES if (path := getattr(config, key)) is not None))
+        """What a sequence was recorded in: parts and copies of a recording share it."""
+        own = _source_of(self.config(name))
+        return self._copies.get(own, own)
+
+    @cached_property
+    def _copies(self) -> dict[str, str]:
+        """By recordings that hold scans of another one, as where they are cut from it, that one."""
+        each, found = {_source_of(one): one for one in self.recordings.values()}, dict[str, str]()
+        for (first, one), (copy, other) in combinations(each.items(), 2):
+            with contextlib.suppress(AdaptuneError):  # who opens it is told
+                both = [RecordedSequence(c.model_copy(update=_WHOLE)) for c in (one, other)]
+                if both[0].shares_scans(both[1]):
+                    found.setdefault(copy, found.get(first, first))
+        return found
 
     def open(self, name: str) -> Recording:
         """Open a sequence, or a recorded course.

@@ -53,6 +53,14 @@ def test_a_copy_among_the_training_sequences_is_told(load, caplog):
     assert "training: 'one' and 'three' hold the same scans, which count twice" in caplog.text
 
 
+def test_a_copy_is_left_out_with_what_it_is_a_copy_of(load, tmp_path):
+    study = load("training=[one, three]", "test=[]")
+    named = {name: study.sequences.recorded_in(name) for name in ("one", "two", "three")}
+    assert named == dict.fromkeys(("one", "three"), str(tmp_path / "one.bag")) | {
+        "two": str(tmp_path / "two.bag")
+    }
+
+
 def write_folder(folder, scans):
     folder.mkdir(exist_ok=True)
     for i, points in enumerate(scans):

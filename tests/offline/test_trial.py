@@ -203,6 +203,8 @@ def test_a_set_that_is_too_slow_is_stopped(study):
     assert int(ms) == round(slow.usage["register_ms"])
     assert int(ms) < 1e3  # of the one scan that it was given
     assert not slow.registered[2:].any()
+    # Wherever it is stopped, it has the same errors.
+    np.testing.assert_array_equal(np.isinf(slow.errors), np.isfinite(good.errors))
     assert not good.failure
 
 
