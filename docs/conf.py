@@ -37,6 +37,8 @@ default_role = "code"
 LINK = re.compile(r"\]\(([\w/-]+)\.md[#)]")
 OBJECTS = """
 adaptune.tuning.tuned: tune Tuned
+adaptune.evaluation.evaluated: evaluate Evaluation
+adaptune.evaluation.judged: Judged
 adaptune.recording: Scan Imu SequenceConfig
 adaptune.recording.recording: open_sequence
 adaptune.trajectory: Trajectory read_trajectory read_tum write_tum read_kitti

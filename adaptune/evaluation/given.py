@@ -67,8 +67,10 @@ def _poses(given: Named, scans: RecordedSequence) -> Trajectory:
             raise AdaptuneError(f"trajectory: {error}; {what}") from error
     if Path(given).is_file():
         return scans.from_file(Path(given))
-    bag, _, topic = ("", "", given) if str(given)[0] == "/" else str(given).partition(":/")
-    if not topic:
+    bag, _, topic = str(given).partition(":/")
+    if Path(bag).suffix not in BAG_SUFFIXES and not Path(bag).exists():
+        bag, topic = "", str(given)
+    if not topic or not (bag or topic.startswith("/")):
         what = "there is no such file; topics begin with /, those of other bags as run2.bag:/odom"
         raise AdaptuneError(f"{given}: {what}")
     source: Any = BagSource(bag_paths([bag]), about=UNOPENED) if bag else scans.source

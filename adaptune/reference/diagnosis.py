@@ -573,13 +573,16 @@ def diagnose_trajectory(
     starts = starts[:: max(1, len(starts) // _EVENLY)]
     T = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends[starts]]
     hops = Hops(starts, ends[starts], T, np.tile(np.eye(3), (len(starts), 1, 1)))
-    if (cause := diagnose_reference(trajectory, stamps, hops, place, _OPTIONS)) is not None:
+    cause = diagnose_reference(trajectory, stamps, hops, place, _OPTIONS)
+    ends_fit = _of_ends(judge, stamps, span, T_odom_sensor, _OPTIONS)
+    if ends_fit is not None and (cause is None or "clock" in cause.what):
+        return ends_fit._replace(where=())
+    if cause is not None:
         return cause._replace(what=cause.what.replace("registrations of scans", "the reference"))
     if (differ := _mean(mismatch(T_odom_sensor, hops))) > _APART:
         what = f"over some metres, most motions differ from the reference's by {differ:.0f} %"
         return Finding((), what, "they are of another drive, or lost nearly everywhere")
-    ends_fit = _of_ends(judge, stamps, span, T_odom_sensor, _OPTIONS)
-    return None if ends_fit is None else ends_fit._replace(where=())
+    return None
 
 
 def contradiction(scans: Recording, reference: Trajectory) -> Finding | None:

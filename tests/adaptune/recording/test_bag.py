@@ -277,7 +277,7 @@ def test_of_transforms_one_frame_is_taken(tmp_path):
         ("/tf", rec.START, rec.ROS1.types["tf2_msgs/msg/TFMessage"](transforms)),
     ]
     bag = rec.write_bag(tmp_path / "a.bag", messages)
-    with pytest.raises(SequenceError, match="name one of them as `child_frame`: base, lidar"):
+    with pytest.raises(SequenceError, match="`child_frame`, or a chain: base, lidar"):
         opened(bag, reference="/tf").reference()
     with pytest.raises(SequenceError, match="did you mean 'lidar'"):
         opened(bag, reference="/tf", child_frame="lida").reference()

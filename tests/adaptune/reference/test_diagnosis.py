@@ -11,7 +11,11 @@ from adaptune.geometry import from_quaternions, invert, to_quaternions
 from adaptune.live.hops import Hops
 from adaptune.recording.scan import Scan
 from adaptune.reference import diagnosis
-from adaptune.reference.diagnosis import diagnose_odometry, diagnose_reference
+from adaptune.reference.diagnosis import (
+    diagnose_odometry,
+    diagnose_reference,
+    diagnose_trajectory,
+)
 from adaptune.trajectory import Trajectory
 
 SCANS = np.arange(0, 60_000_000_000, 100_000_000)
@@ -355,3 +359,43 @@ def test_of_slow_scans_some_are_enough(monkeypatch, metres, seconds, used):
     assert diagnosis.mismatch(T, found).max() < 1.0
     between = np.diff(np.unique(np.array(read))[2:]) / (seconds * 1e9)
     assert np.median(between) == used
+
+
+def rarely(every):
+    return lambda T: Trajectory(SCANS[::every], T[::every], 100.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (carried, '--extrinsic "-0.801, -0.3, '),
+        (turned, '--extrinsic "0, 0, 0, 0, 0, -0.707'),
+        (invert, "look inverted"),
+        (transposed, "rotations were transposed"),
+        (quaternions([3, 0, 1, 2]), "qx qy qz qw"),
+        (lambda T: Trajectory(SCANS + 400_000_000, T), "add -0.400 to `--clock-offset`"),
+        (lambda _: Trajectory(SCANS[:-1], poses(SCANS[:-1] + 100_000_000)), "--pose-time end"),
+        (lambda T: counted(T, ways=1.05), "its own error, and no option mends it"),
+        (lambda T: T[::-1], "of another drive, or lost nearly everywhere"),
+        (lambda T: T, None),
+        (noisy, None),
+        (rarely(10), None),
+        (rarely(30), None),
+    ],
+)
+def test_what_a_trajectory_is_and_the_option_that_mends_it(make, words):
+    T = poses(SCANS)
+    made = make(T)
+    made = made if isinstance(made, Trajectory) else Trajectory(SCANS, made)
+    found = diagnose_trajectory(made, Trajectory(SCANS, T), made.stamps[:-4], 100_000_000)
+    assert (found is None) == (words is None), found
+    assert words is None or words in str(found)
+
+
+def test_a_reference_that_contradicts_its_scans_is_told(monkeypatch):
+    monkeypatch.setattr(diagnosis, "measured_motions", lambda scans, _: [*scans] and hops())
+    scans = Recorded(poses(SCANS))
+    scans.n_messages = len(SCANS)
+    assert diagnosis.contradiction(scans, Trajectory(POSES, poses(POSES))) is None
+    found = diagnosis.contradiction(scans, Trajectory(POSES, turned(poses(POSES))))
+    assert "other axes" in found.what
