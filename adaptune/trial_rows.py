@@ -127,7 +127,7 @@ def by_odometry(table: Sequence[Row]) -> Listing | None:
         # The first trial of each has its own parameters.
         one = {"odometry": label, "its own parameters [%]": mine[0]["mean"]}
         one |= {"tuned [%]": best.get("mean"), "trial": best.get("trial")}
-        rows.append(one | {"cost [ms]": best.get("cost [ms]", best.get("cost"))})
+        rows.append(one | {"cost [ms]": best.get("cost")})
     rows.sort(key=lambda row: np.inf if row["tuned [%]"] is None else row["tuned [%]"])
     title = "RTE of each odometry in training, over parts of the recordings"
     return Listing(title, rows) if len(rows) > 1 else None

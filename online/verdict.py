@@ -145,13 +145,15 @@ def verdict(
     own = next((row for row in front if row["recommended"]), None)
     trial, base = None if own is None else own["trial"], last.get(BASELINE)
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
-    where = f"(RTE over {length:g} m, {_where(rows)}{judge})"
+    where = f"RTE over {length:g} m, {_where(rows)}{judge}"
     if best is base:
-        said = [f"Keep {CALLED[BASELINE]}: {_error_and_cost(best)} {where}."]
+        said = [f"Keep {CALLED[BASELINE]}: {_error_and_cost(best)} ({where})."]
         said += _why_kept(best, last, recommended, tried)
     else:
         what = called(best.mode) + (f" (trial {trial})" if best.mode == FIXED and trial else "")
-        said = [f"Drive {what}: {_gained(best, base, where, own)}."]
+        gained = [f"{_error_and_cost(best)} ({where})."]
+        gained = gained if base is None else _gained(best, base, where, own)
+        said = [f"Drive {what}: {gained[0]}", *gained[1:]]
     if bank := last.get(ADAPTIVE):
         first = "Adapting: " if bank is best else "With cores to spare: adaptive, "
         same = FIXED in last and _is_baseline(last[FIXED])
@@ -168,19 +170,17 @@ def _error_and_cost(row: ComparisonRow) -> str:
 
 
 def _gained(
-    best: ComparisonRow, base: ComparisonRow | None, where: str, own: Mapping[str, Any] | None
-) -> str:
-    """What is advised instead of the baseline, here and on another drive."""
-    if base is None:
-        return f"{_error_and_cost(best)} {where}"
+    best: ComparisonRow, base: ComparisonRow, where: str, own: Mapping[str, Any] | None
+) -> list[str]:
+    """What is advised gives instead of the baseline, here and on another drive."""
     said = f"{best.rte:.3f} % instead of {base.rte:.3f} % with {CALLED[BASELINE]}"
     if best.cpu_ms and base.cpu_ms:
         said += f", for {best.cpu_ms:.1f} instead of {base.cpu_ms:.1f} ms a scan"
     ratio = _to_baseline(best)
-    said += f" {where}: {ratio.value:.2f} times the error ({_interval(ratio)})"
-    if own is None or own["low"] is None:
-        return said
-    return f"{said}; on another drive, {_end(own['low'])} to {_end(own['high'])} times"
+    sure = f"That is {ratio.value:.2f} times the error ({_interval(ratio)}; {where})"
+    if own is not None and own["low"] is not None:
+        sure += f"; on another drive, expect {_end(own['low'])} to {_end(own['high'])} times"
+    return [f"{said}.", f"{sure}."]
 
 
 def _why_kept(

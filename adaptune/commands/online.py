@@ -328,6 +328,8 @@ def say_compared(
     loaded: "OfflineStudy", found: "ComparedReplays", page: Path, *, details: bool = False
 ) -> None:
     """Print what to do and what may be driven; with `details`, all that is on the page."""
+    from adaptune import trial_rows
+    from adaptune.archive import Archive
     from online.tables import controls, tables
 
     length = loaded.config.sub_trajectory
@@ -339,6 +341,10 @@ def say_compared(
         say(sentence)
     for made in tables(found.rows, length) if details else controls(found.rows, length):
         show_table(*made)
+    if details and len(loaded.config.odometries) > 1:
+        finished = trial_rows.rows(Archive(loaded.folder / "trials"), loaded.training)
+        if each := trial_rows.by_odometry(finished):
+            show_table(*each)
 
 
 def record(

@@ -267,7 +267,6 @@ def tune(
     when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
-    from adaptune.trial_rows import by_odometry
     from adaptune.tuning.studies import LACKING, proposed_system
     from adaptune.tuning.tuned import tune_asked
 
@@ -290,8 +289,6 @@ def tune(
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)
     for sentence in tuned.training.failed:
         say(sentence)
-    if details and (odometries := by_odometry(tuned.training.trials)):
-        show_table(*odometries)
     if tuned.more:
         _say_grown(tuned.more, tuned.before, tuned.fixed)
     _say_recordings(tuned)
