@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
     from adaptune.tuning.tuned import Tuned
     from offline.config import OfflineStudy
-    from offline.train import Training
 
 
 def inspect(
@@ -296,7 +295,7 @@ def tune(
     if tuned.more:
         _say_grown(tuned.more, tuned.before, tuned.fixed)
     _say_recordings(tuned)
-    say_odometries(tuned.study, tuned.training)
+    say_odometries(tuned)
     say_next("replays to look at in Foxglove", "record", tuned.study.folder)
 
 
@@ -341,31 +340,40 @@ def _say_recordings(tuned: "Tuned") -> None:
     )
 
 
-def say_odometries(study: "OfflineStudy", training: "Training") -> None:
-    """Of several odometries, what each gives with its own parameters and tuned, in training."""
-    from adaptune.space import ODOMETRY
+def say_odometries(tuned: "Tuned") -> None:
+    """Of several odometries, which does best on the test, and what each has there, and tuned."""
+    from adaptune.report.tables import cell_text
     from offline.front import COST
 
-    labels = list(study.config.odometries)
-    if len(labels) < 2:
+    if not (rows := tuned.of_each):
         return
-    rows = []
-    for label in labels:
-        mine = [row for row in training.trials if row[ODOMETRY] == label]
-        known = [row for row in mine if row["mean"] is not None]
-        best = min(known, key=lambda row: row["mean"], default=None)
-        rows.append(
-            {
-                "odometry": label,
-                "its own parameters [%]": mine[0]["mean"] if mine else None,
-                "tuned [%]": None if best is None else best["mean"],
-                COST: None if best is None else best[COST],
-            }
-        )
-    rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))
-    fixed = training.model.sets[training.model.fixed][ODOMETRY]
-    say(
-        f"Best odometry in training: {rows[0]['odometry']}. On the test, the fixed set is "
-        f"{fixed}'s, the baseline {labels[0]}'s; to see another there, name it alone (--odometry)."
+    best = rows[0]
+    if best["test [%]"] is not None:
+        what = "its own parameters" if best["own"] else f"trial {best['trial']}"
+        cost = f"{cell_text(best['test [%]'])} % at {cell_text(best[COST])} ms a scan"
+        said = f"Best odometry on the test: {best['odometry']} with {what}, {cost}."
+        allowed = tuned.training.model.allowed()
+        if allowed is not None and best["trial"] not in allowed:
+            said += " It costs more than the budget."
+        say(said)
+    for row in rows:
+        if row["state"] != "complete":
+            say(f"Not run on the test: {row['odometry']}, trial {row['trial']}: {row['state']}.")
+    first = next(iter(tuned.study.config.odometries))
+    shown = [
+        {
+            "odometry": row["odometry"],
+            "parameters": "its own" if row["own"] else f"trial {row['trial']}",
+            "test [%]": row["test [%]"],
+            f"vs {first}'s own": row["vs first"],
+            "95 %": row["95 %"],
+            COST: row[COST],
+            "training [%]": row["training [%]"],
+        }
+        for row in rows
+    ]
+    show_table(
+        "RTE of each odometry, in trials on the test",
+        shown,
+        "A trial goes on from the reference after an impossible motion; the modes above do not.",
     )
-    show_table("RTE of each odometry in training", rows)
