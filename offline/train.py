@@ -14,15 +14,16 @@ from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.machine import available, spare_memory
-from adaptune.metrics import cap, lost_in_words
+from adaptune.metrics import cap, lost_in_words, span
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
+from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.progress import Progress, unseen
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
-from adaptune.space import ParameterSet, ParameterSets, in_words
+from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
@@ -373,10 +374,22 @@ def run_oracle(
     Returns for every test sequence the errors of the fixed set and of the best one, in percent.
     """
     model = study.model()
+    archive, names = _on_test(study, model, oracle_sets(model, n_sets), progress, cluster)
+    found = {name: oracle_errors(archive, name, model) for name in names}
+    return [_oracle_row(name, errors) for name, errors in found.items() if errors is not None]
+
+
+def _on_test(
+    study: OfflineStudy,
+    model: ErrorModel,
+    numbers: Sequence[int],
+    progress: Progress,
+    cluster: str | None,
+    kind: str = "oracle",
+) -> tuple[Archive, list[str]]:
+    """Run sets as trials on the test sequences with a reference; where they are, and on which."""
     study.open()
-    names = _judged(study, progress)
-    numbers = oracle_sets(model, n_sets)
-    archive = study.archive("oracle")
+    names, archive = _judged(study, progress), study.archive(kind)
     archive.renew(names)
     for name in names:
         _remove_other_sets(archive, name, model)
@@ -392,8 +405,50 @@ def run_oracle(
             for done in schedule.run(workers):
                 schedule.store(*done)
         schedule.close()
-    found = {name: oracle_errors(archive, name, model) for name in names}
-    return [_oracle_row(name, errors) for name, errors in found.items() if errors is not None]
+    return archive, names
+
+
+def odometry_rows(
+    study: OfflineStudy,
+    training: Training,
+    progress: Progress = unseen,
+    cluster: str | None = None,
+) -> list[dict[str, Any]]:
+    """What each of several odometries has with its own parameters and tuned, the best first.
+
+    These sets run as trials on the test sequences, for which ``odometries`` in the study's folder
+    is. Ratios, with 95 % intervals, are to the baseline's error. No rows for a single odometry.
+    """
+    labels, model, rows = list(study.config.odometries), training.model, list[dict[str, Any]]()
+    for one in labels if len(labels) > 1 else ():
+        mine = [row for row in training.trials if row[ODOMETRY] == one]
+        best = min(mine, key=lambda row: (row["state"] != "complete", row["mean"] or np.inf))
+        for row in mine[:1] + [best] * (best is not mine[0]):
+            about = {"odometry": one, "trial": row["trial"], "own": row is mine[0]}
+            rows.append(
+                about | {"training [%]": row["mean"], COST: row[COST], "state": row["state"]}
+            )
+    if not rows:
+        return []
+    known = [row["trial"] for row in rows if row["state"] == "complete"]
+    archive, names = _on_test(study, model, known, progress, cluster, "odometries")
+    pairs: dict[int, list[Pair]] = {trial: [] for trial in known}
+    for name in names:
+        if (found := oracle_errors(archive, name, model)) is None:
+            continue
+        errors = dict(zip(found.trials, cap(found.errors).T, strict=True))
+        block = span(archive.read_frames(name).counted, model.length)
+        for trial, of in pairs.items():
+            both = np.stack([errors[trial], errors[known[0]]])
+            both = both[:, ~np.isnan(both).any(axis=0)]
+            if both.size:
+                of.append(Pair(both, block, study.sequences.recorded_in(name)))
+    for row in rows:
+        of = pairs.get(row["trial"], [])
+        row["test [%]"] = float(np.mean([p.errors[0].mean() for p in of])) if of else None
+        value, ends, _ = ratio(of) if of else Ratio(np.nan)
+        row |= {"vs first": value if of else None, "95 %": in_cell(ends) if of else None}
+    return sorted(rows, key=lambda row: (row["test [%]"] is None, row["test [%]"] or 0.0))
 
 
 def oracle_sets(model: ErrorModel, n: int) -> list[int]:

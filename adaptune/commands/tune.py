@@ -292,6 +292,7 @@ def tune(
     if tuned.more:
         _say_grown(tuned.more, tuned.before, tuned.fixed)
     _say_recordings(tuned)
+    say_odometries(tuned)
     say_next("replays to look at in Foxglove", "record", tuned.study.folder)
 
 
@@ -333,4 +334,43 @@ def _say_recordings(tuned: "Tuned") -> None:
         "Each recording left out, the worst first",
         rows,
         "Recommended is the finalist that the others choose; for the test, the fixed set.",
+    )
+
+
+def say_odometries(tuned: "Tuned") -> None:
+    """Of several odometries, which does best on the test, and what each has there, and tuned."""
+    from adaptune.report.tables import cell_text
+    from offline.front import COST
+
+    if not (rows := tuned.of_each):
+        return
+    best = rows[0]
+    if best["test [%]"] is not None:
+        what = "its own parameters" if best["own"] else f"trial {best['trial']}"
+        cost = f"{cell_text(best['test [%]'])} % at {cell_text(best[COST])} ms a scan"
+        said = f"Best odometry on the test: {best['odometry']} with {what}, {cost}."
+        allowed = tuned.training.model.allowed()
+        if allowed is not None and best["trial"] not in allowed:
+            said += " It costs more than the budget."
+        say(said)
+    for row in rows:
+        if row["state"] != "complete":
+            say(f"Not run on the test: {row['odometry']}, trial {row['trial']}: {row['state']}.")
+    first = next(iter(tuned.study.config.odometries))
+    shown = [
+        {
+            "odometry": row["odometry"],
+            "parameters": "its own" if row["own"] else f"trial {row['trial']}",
+            "test [%]": row["test [%]"],
+            f"vs {first}'s own": row["vs first"],
+            "95 %": row["95 %"],
+            COST: row[COST],
+            "training [%]": row["training [%]"],
+        }
+        for row in rows
+    ]
+    show_table(
+        "RTE of each odometry, in trials on the test",
+        shown,
+        "A trial goes on from the reference after an impossible motion; the modes above do not.",
     )

@@ -2,7 +2,7 @@
 
 import base64
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +42,7 @@ class Tuned:
     page: Path  # HTML, with all charts and tables
     more: Sequence[str] = ()  # recordings that the study did not name before
     before: "ParameterSet | None" = None  # the fixed set before, where there was one
+    of_each: Sequence[Mapping[str, Any]] = ()  # see `odometries`
 
     @property
     def verdict(self) -> str:
@@ -86,6 +87,11 @@ class Tuned:
     def modes(self) -> Any:
         """A row for each mode on each recording of the test, and on all of them."""
         return _table([row.columns() for row in self.comparison.rows])
+
+    @property
+    def odometries(self) -> Any:
+        """Of several odometries, two rows for each: its own parameters, and its best set."""
+        return _table(self.of_each)
 
     @property
     def left_out(self) -> Any:
@@ -231,7 +237,7 @@ def tune_asked(
     from adaptune.odometry.registry import forget_user_code
     from offline.config import load_study
     from offline.search import ELAPSED, Stopwatch
-    from offline.train import train
+    from offline.train import odometry_rows, train
     from online.modes import run_replays
 
     check_guarded("tune")
@@ -247,7 +253,8 @@ def tune_asked(
     with closing(study):
         training = train(study, show, cluster, clock)
         run_replays(study, study.model_path, show)
-        return Tuned(study, training, *compared(study), more, before)
+        of_each = odometry_rows(study, training, show, cluster)
+        return Tuned(study, training, *compared(study), more, before, of_each)
 
 
 def _paths(given: Paths) -> list[Path]:

@@ -1,5 +1,7 @@
 import shutil
+from dataclasses import replace
 
+import fake_odometry
 import numpy as np
 import pytest
 from commands import succeeded
@@ -9,7 +11,7 @@ from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.study.oracle import oracle_errors
 from offline.config import load_study
-from offline.train import oracle_sets, run_oracle, train
+from offline.train import odometry_rows, oracle_sets, run_oracle, train
 
 N = 5
 
@@ -79,3 +81,27 @@ def test_it_resumes_and_renews_what_has_changed(load, caplog):
     assert row["sets"] == 2
     assert len(oracle_errors(other.archive("oracle"), "three", model).errors) < 40
     assert not files[oracle_sets(model, 4)[3]].exists()
+
+
+def test_each_of_several_odometries_is_run_on_the_test(study_file, tmp_path):
+    fake = f"{{name: {fake_odometry.NAME}, label: LABEL}}"
+    two = ", ".join(fake.replace("LABEL", label) for label in ("one", "two"))
+    overrides = [f"odometry=[{two}]", "offline.trials=5", "offline.initial=5"]
+    study = load_study(study_file, overrides, tmp_path)
+    training = train(study)
+    rows = odometry_rows(study, training)
+    tested = [row["test [%]"] for row in rows]
+    assert tested == sorted(tested)
+    assert {(row["odometry"], row["own"]) for row in rows} >= {("one", True), ("two", True)}
+    own = {row["odometry"]: row for row in rows if row["own"]}
+    assert own["one"]["vs first"] == own["two"]["vs first"] == 1.0  # the same code
+    best = next(row for row in rows if not row["own"])
+    archive = study.archive("odometries")
+    errors = cap(archive.read_errors("three", [best["trial"]]))
+    assert best["test [%]"] == pytest.approx(np.nanmean(errors))
+    # What is there is not run again, and a single odometry has no such rows.
+    assert odometry_rows(study, training) == rows
+    alone = replace(
+        study, config=study.config.model_copy(update={"odometry": study.config.odometries["one"]})
+    )
+    assert odometry_rows(alone, training) == []

@@ -10,11 +10,13 @@ import drives
 import pytest
 import rec
 
+from adaptune.commands.tune import say_odometries
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.tuning import asked, tuned
 from adaptune.yaml12 import Document
 from offline.config import load_study
+from offline.front import COST
 
 FAKE = ("--odometry", "fake_odometry:Fake")
 
@@ -174,6 +176,33 @@ def test_a_folder_that_grows_changes_only_the_lists_of_its_study(study_file):
     study = study_in(path)
     assert (study.training, study.config.test) == (["one", "three"], ("two",))
     assert study.config.offline.stretches == 24
+
+
+def test_of_several_odometries_each_has_its_rows_on_the_test(monkeypatch):
+    said, shown = [], []
+    monkeypatch.setattr("adaptune.commands.tune.say", said.append)
+    monkeypatch.setattr(
+        "adaptune.commands.tune.show_table", lambda _, rows, *__: shown.extend(rows)
+    )
+    row = {"vs first": 0.5, "95 %": "0.4-0.6", COST: 12.0, "training [%]": 1.0, "state": "complete"}
+    lost = {"test [%]": None, "vs first": None, "95 %": None, "state": "failed: 10 faults"}
+    of_each = [
+        row | {"odometry": "ndt", "trial": 5, "own": False, "test [%]": 0.62},
+        row | {"odometry": "gicp", "trial": 0, "own": True, "test [%]": 1.24},
+        row | {"odometry": "mine:Icp", "trial": 1, "own": True} | lost,
+    ]
+    study = SimpleNamespace(config=SimpleNamespace(odometries={"gicp": 0, "ndt": 0}))
+    training = SimpleNamespace(model=SimpleNamespace(allowed=lambda: (0, 1)))
+    say_odometries(SimpleNamespace(of_each=of_each, study=study, training=training))
+    assert said == [
+        "Best odometry on the test: ndt with trial 5, 0.620 % at 12.0 ms a scan. It costs more "
+        "than the budget.",
+        "Not run on the test: mine:Icp, trial 1: failed: 10 faults.",
+    ]
+    assert [row["parameters"] for row in shown] == ["trial 5", "its own", "its own"]
+    assert shown[0]["vs gicp's own"] == 0.5
+    say_odometries(SimpleNamespace(of_each=()))
+    assert len(said) == 2
 
 
 @pytest.mark.usefixtures("decided")
