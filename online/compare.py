@@ -3,6 +3,7 @@
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from adaptune.paired import Ratio, ratio
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.driven import PER_STRETCH
+from adaptune.study.driven import PER_STRETCH, another_odometry
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
@@ -354,6 +355,7 @@ def _lost(
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
         [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
+        partial(another_odometry, study),
     )
     if said:
         judge = " by an estimated reference" * any(row.reference == "estimated" for row in known)
@@ -400,7 +402,9 @@ def _of_training(model: ErrorModel) -> list[str]:
     means = rules.mean_errors(model.errors, model.sequence)
     trial = model.sets.trials[int(np.argmin(means))]
     costs = [np.nan if model.costs is None else model.costs.alone(t) for t in (trial, model.fixed)]
-    if not means.min() <= LOST_ABOVE or not costs[0] > costs[1]:
+    # What costs no more than the baseline is within every budget.
+    base = np.nan if model.costs is None else model.costs.alone(rules.BASELINE)
+    if not means.min() <= LOST_ABOVE or not costs[0] > costs[1] or costs[0] <= base:
         return []
     has = f"trial {trial} has {means.min():.2f} % at {costs[0]:.0f} ms a scan"
     return [f"In training {has}: `online.budget: {np.ceil(costs[0]):.0f}` allows it."]

@@ -10,9 +10,10 @@ import pytest
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
+from adaptune.metrics import LOST_ABOVE
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import SetCost, mean_errors
-from adaptune.study.driven import ModeError, bank_members
+from adaptune.study.driven import ModeError, another_odometry, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
 from online.compare import NONE, compare
@@ -52,6 +53,15 @@ def test_where_track_is_lost_it_names_what_kept_it_in_training(replayed, monkeyp
     assert found.verdict[-1].startswith(f"In training trial {best} has {means.min():.2f} % at ")
     monkeypatch.setattr("online.compare.LOST_ABOVE", 0.0)
     assert compare(replayed).verdict == found.verdict[:-1]
+
+
+def test_another_odometry_is_tried_where_track_is_lost(trained):
+    name, error = another_odometry(trained, "three")
+    assert name == "gicp"
+    assert 0.0 < error < LOST_ABOVE
+    of_gicp = trained.config.odometry.model_copy(update={"name": "gicp"})
+    config = trained.config.model_copy(update={"odometry": of_gicp})
+    assert another_odometry(replace(trained, config=config), "three")[0] == "kiss_icp"
 
 
 def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, monkeypatch):
