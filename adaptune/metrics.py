@@ -238,11 +238,13 @@ def lost_in_words(
     odometry: str,
     find_cause: Callable[[str], str],
     faults: Iterable[str] = (),
+    find_other: Callable[[str], tuple[str, float]] = lambda _: ("", math.inf),
 ) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
     `errors` has by sequence the mean error of the best, in percent; `find_cause` says what is known
-    of the cause on the worst one; `faults` are what went wrong in the odometry.
+    of the cause on the worst one; `faults` are what went wrong in the odometry. `find_other` has
+    the name and the error of another odometry there.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
@@ -250,7 +252,14 @@ def lost_in_words(
     lost = f"Even with {best} track is lost on {where}: RTE {mean:.1f} %. "
     if fault := next(filter(None, faults), ""):
         return [f"{lost}The odometry itself failed there: {fault}. Mend that first."]
-    if cause := find_cause(max(errors, key=lambda name: errors[name])):
+    worst = max(errors, key=lambda name: errors[name])
+    other, error = find_other(worst)
+    if error <= LOST_ABOVE:
+        return [
+            f"{lost}{other} holds track on {worst}, with {error:.2f} %: it is the odometry, not "
+            f"the data. Drive {other}, or widen the ranges of the parameters."
+        ]
+    if cause := find_cause(worst):
         help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
         return [f"{lost}The likeliest cause: {cause}. {help_}."]
     return [

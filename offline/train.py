@@ -4,6 +4,7 @@ import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
+from adaptune.study.driven import another_odometry
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -138,6 +140,7 @@ def train(
         {row["sequence"]: row["fixed, whole"] for row in rows},
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
+        find_other=partial(another_odometry, study),
     )
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])

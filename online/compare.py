@@ -3,6 +3,7 @@
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from adaptune.reference.check import hard_to_track
 from adaptune.reference.judge import StandardErrors
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.driven import PER_STRETCH
+from adaptune.study.driven import PER_STRETCH, another_odometry
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
@@ -357,6 +358,7 @@ def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> l
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
         [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
+        partial(another_odometry, study),
     )
     return [*said, "Until then, rely on none."] if said else []
 

@@ -2,18 +2,46 @@
 
 import math
 from collections.abc import Mapping
+from itertools import islice
+
+import numpy as np
 
 from adaptune.errors import AdaptuneError
+from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE, STANDBY
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import Factory
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.tracker import Tracker
 from adaptune.paired import MIN_RECORDINGS
 from adaptune.space import ODOMETRY, ParameterSet
 from adaptune.study.config import OnlineConfig, SwitchingConfig
-from adaptune.study.study import Mechanism
+from adaptune.study.study import Mechanism, Study
 
 PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
+
+
+MOST_SCANS = 600
+"""Scans of a recording on which another odometry is tried: seconds."""
+
+
+def another_odometry(study: Study, name: str) -> tuple[str, float]:
+    """Another odometry, with its own parameters, and its mean error in percent on a sequence."""
+    own = {one.name for one in study.config.odometries.values()}
+    other = "kiss_icp" if "gicp" in own else "gicp"
+    scans, stamps, T_odom_sensor = study.sequences.open(name), [], []
+    tracker = Tracker(InProcess(odometry_class(other)()), study.config.health)
+    for scan in islice(scans, MOST_SCANS):
+        stamps.append(scan.stamp)
+        T_odom_sensor.append(tracker.register(scan).T_odom_sensor)
+    if (reference := scans.reference()) is None:
+        return other, math.inf
+    T_ref_sensor = reference.at(np.array(stamps))
+    errors = sub_trajectory_rte(T_ref_sensor, np.array(T_odom_sensor), study.config.sub_trajectory)
+    known = cap(errors)[~np.isnan(errors)]
+    return other, float(known.mean()) if len(known) else math.inf
 
 
 class ModeError(AdaptuneError):

@@ -165,6 +165,13 @@ def test_a_large_error_has_words():
     # The worst sequence tells.
     (words,) = said({"one": 1.0, "two": 10.0}, two="night")
     assert "The likeliest cause: night." in words
+    held = {"two": ("gicp", 0.619)}
+    (words,) = lost_in_words("x", {"two": 9.0}, "a", lambda _: "night", (), lambda name: held[name])
+    assert "gicp holds track on two, with 0.62 %: it is the odometry, not the data." in words
+    assert "night" not in words
+    held["two"] = ("gicp", 25.0)
+    (words,) = lost_in_words("x", {"two": 9.0}, "a", lambda _: "night", (), lambda name: held[name])
+    assert "The likeliest cause: night." in words
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.015, 0.05, 0.1])

@@ -10,9 +10,10 @@ import pytest
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
+from adaptune.metrics import LOST_ABOVE
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import mean_errors
-from adaptune.study.driven import ModeError, bank_members
+from adaptune.study.driven import ModeError, another_odometry, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
 from online.compare import NONE, compare
@@ -45,6 +46,15 @@ def test_where_track_is_lost_nothing_is_advised_and_all_is_listed(replayed, monk
     assert found.verdict[-1] == "Until then, rely on none."
     assert {row["mode"] for row in found.front} >= {"baseline", "adaptive"}
     assert not any(row["recommended"] for row in found.front)
+
+
+def test_another_odometry_is_tried_where_track_is_lost(trained):
+    name, error = another_odometry(trained, "three")
+    assert name == "gicp"
+    assert 0.0 < error < LOST_ABOVE
+    of_gicp = trained.config.odometry.model_copy(update={"name": "gicp"})
+    config = trained.config.model_copy(update={"odometry": of_gicp})
+    assert another_odometry(replace(trained, config=config), "three")[0] == "kiss_icp"
 
 
 def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, monkeypatch):
