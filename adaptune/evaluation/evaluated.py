@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from adaptune.errors import AdaptuneError
-from adaptune.evaluation.given import Convention, Named, name_of, read
+from adaptune.evaluation.given import Convention, Named, convention, name_of, read
 from adaptune.evaluation.judged import Judge, Judged, pair_of
 from adaptune.evaluation.shown import Compared, in_words, write_evaluation
-from adaptune.geometry import to_pose
 from adaptune.paired import ratio
 from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.config import ESTIMATED
@@ -103,30 +102,18 @@ def evaluate(
         Folder of the page, the tables and the estimated references; and what is called with how
         far each task is, by default bars.
     """
-    try:
-        place = None if extrinsic is None else to_pose(extrinsic)
-    except ValueError as error:
-        raise AdaptuneError(f"extrinsic: {error}") from error
-    wrong = {
-        "name a trajectory: a file of poses, or a topic": not trajectories,
-        f"pose_time: give stamp or end, not {pose_time}": pose_time not in ("stamp", "end"),
-        "sub_trajectory: give metres, more than 0": not (sub_trajectory or 1.0) > 0.0,
-    }
-    for words in (words for words, is_wrong in wrong.items() if is_wrong):
-        raise AdaptuneError(words)
+    if not trajectories:
+        raise AdaptuneError("name a trajectory: a file of poses, or a topic")
+    if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
+        raise AdaptuneError("sub_trajectory: give metres, more than 0")
     given = [recordings] if isinstance(recordings, str | Path) else recordings
     paths = recordings_at(list(map(Path, given)), reading)
     for one in (reference, *trajectories) if len(paths) > 1 else ():
         if not (one in (None, ESTIMATED) or (isinstance(one, str) and one[:1] == "/")):
             what = f"is of one recording, and there are {len(paths)}; name topics that each has"
             raise AdaptuneError(f"{name_of(one)}: {what}")
-    asked = _Asked(
-        trajectories,
-        None if reference is None else str(reference),
-        sub_trajectory,
-        Convention(place, clock_offset, pose_time),
-        Path(out),
-    )
+    by, chosen = convention(extrinsic, clock_offset, pose_time), reference and str(reference)
+    asked = _Asked(trajectories, chosen, sub_trajectory, by, Path(out))
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
         judge = asked.reference or ESTIMATED

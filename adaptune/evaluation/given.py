@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, to_pose
 from adaptune.recording.bag import UNOPENED, BagSource
 from adaptune.recording.config import BAG_SUFFIXES, bag_paths
 from adaptune.recording.recording import RecordedSequence
@@ -25,6 +25,17 @@ class Convention(NamedTuple):
     T_body_sensor: Poses | None = None  # the LiDAR's pose in their frame
     clock_offset: float = 0.0  # seconds to add to their stamps
     pose_time: Literal["stamp", "end"] = "stamp"  # the moment of a scan that they are of
+
+
+def convention(extrinsic: Any, clock_offset: float, pose_time: Any) -> Convention:
+    """What a user says of the poses; an AdaptuneError says what is wrong with it."""
+    if pose_time not in ("stamp", "end"):
+        raise AdaptuneError(f"pose_time: give stamp or end, not {pose_time}")
+    try:
+        place = None if extrinsic is None else to_pose(extrinsic)
+    except ValueError as error:
+        raise AdaptuneError(f"extrinsic: {error}") from error
+    return Convention(place, clock_offset, pose_time)
 
 
 def parted(words: Sequence[str]) -> tuple[list[Path], list[str]]:
