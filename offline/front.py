@@ -17,6 +17,7 @@ from adaptune.recording.scan import Recording
 from adaptune.space import ODOMETRY, in_words
 from adaptune.study.study import FIXED_SET, MODEL
 from offline.choice import (
+    LEAST_COST,
     MOST_OF_PERIOD,
     Elsewhere,
     allowed_cost,
@@ -95,19 +96,17 @@ def left_out(
     `every` has all sets, `data` those that may be chosen with their drives of whole recordings;
     those that are `worse` drive them badly without the health check.
     """
-    costs, bank = data.beside or every.costs, model.recommended == BANK
-    whole = data.driven_blocks()
+    costs, whole = data.beside or every.costs, data.driven_blocks()
     for tried in (whole, every.blocks()):
         if not len((blocks := tried.tracked()).errors):
             return ""
         means, _ = mean_and_error(blocks.errors, blocks.sequence)
-        errors = means / means[list(blocks.trials).index(model.fixed)]
-        ms = np.array([costs.alone(trial) for trial in blocks.trials])
-        if bank:
-            errors /= model.expected["geometric"]
-            ms /= costs.adaptive(t for t in model.bank if t not in model.reserve)
-        else:
-            ms /= costs.alone(model.fixed)
+        least, ms = means[list(blocks.trials).index(model.fixed)], costs.alone(model.fixed)
+        if model.recommended == BANK:
+            least *= model.expected["geometric"]
+            ms = costs.adaptive(t for t in model.bank if t not in model.reserve)
+        errors = means / max(least, 1e-9)
+        ms = np.maximum([costs.alone(t) for t in blocks.trials], LEAST_COST) / max(ms, LEAST_COST)
         dominates = (errors <= AS_GOOD) & (ms <= AS_GOOD) & (errors * ms < CHEAPER)
         if dominates.any():
             k = int(np.argmin(np.where(dominates, errors * ms, np.inf)))

@@ -155,7 +155,8 @@ def verdict(
         gained = gained if base is None else _gained(best, base, where, own)
         said = [f"Drive {what}: {gained[0]}", *gained[1:]]
     if bank := last.get(ADAPTIVE):
-        first = "Adapting: " if bank is best else "With cores to spare: adaptive, "
+        gains = bank is not best and _ratio(bank).value < 1.0
+        first = "With cores to spare: adaptive, " if gains else "Adapting: "
         same = FIXED in last and _is_baseline(last[FIXED])
         said.append(f"{first}{_to_yardstick(bank, last, 'their' if same else '')}.")
     elif obstacle:

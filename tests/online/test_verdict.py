@@ -70,6 +70,12 @@ def test_what_to_drive_and_what_adapting_adds():
     ]
 
 
+def test_a_bank_that_gains_nothing_is_not_offered():
+    assert said_of(every(adaptive=1.01))[-1].startswith(
+        "Adapting: 1.01 times the fixed set's error"
+    )
+
+
 def test_what_may_be_driven_by_cost():
     rows = [
         replace(row, cpu_ms=40.0) if row.mode == "adaptive" else row for row in every(adaptive=0.8)
