@@ -265,13 +265,12 @@ class Forecast(NamedTuple):
 
     each: float  # to try a set on all training sequences
     rest: float  # of what follows: finalists' drives of whole recordings, and the replays
-    over: float = 0.0  # for banks, beyond the time that is allowed
 
     def words(self, left: float, most: float) -> str:
         """How long it takes to try so many sets and to finish, in at most so many seconds."""
         n, whole = left, self.each * left + self.rest
         if whole > most:
-            n, whole = max(0.0, (most - self.rest) // max(self.each, 1e-9)), most + self.over
+            n, whole = max(0.0, (most - self.rest) // max(self.each, 1e-9)), most
         return f"it takes {about(whole)}: {n:.0f} parameter sets of {self.each:.1f} s, and the rest"
 
 
@@ -293,17 +292,16 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
             n_sets = len(baselines) + FINALISTS + 2 * OTHERS
             rest += COST * costs[-1] * len(frames.stamps) * n_sets
     workers = max(workers, 1)  # those of a cluster may come later
-    rest, over = FITTING + rest / workers, 0.0
+    rest = FITTING + rest / workers
     if clock.replays:
         members = study.config.online.switching.size if study.mechanism == "bank" else 0
         scans = sum(study.sequences.open(name).n_messages for name in study.config.test)
         replay = float(np.mean(costs)) * scans
         rest += replay * ALONE
         free = LEFT_BY_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest
-        banks = replay * len(study.rules) * (members + 1)
-        over = max(banks - max(free, 0.0), 0.0)
-        rest += banks - over
-    return Forecast(each / workers, rest, over)
+        # A bank that takes longer is not replayed.
+        rest += min(replay * len(study.rules) * (members + 1), max(free, 0.0))
+    return Forecast(each / workers, rest)
 
 
 class Campaign:
@@ -350,6 +348,17 @@ class Campaign:
         _log.info("the search ends: %s", search.end)
         self._show("runs", search.total * len(self._names), 0)
         return dict(sorted(search.done.items()))
+
+    @property
+    def words(self) -> list[str]:
+        """How many sets were tried, where the time ended the search before all were."""
+        if self._search.end != TIME_IS_UP:
+            return []
+        n, own, of = len(self._search.sets), len(self._baselines), self._config.most_trials
+        tried = f"{n} of {of}" if of else f"{n}"
+        return [
+            f"{tried} parameter sets were tried, {own} of them the odometry's own: {TIME_IS_UP}."
+        ]
 
     def _begin(self) -> None:
         """Begin as many trials as can begin now."""

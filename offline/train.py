@@ -72,7 +72,8 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     said: Sequence[str] = ()  # further sentences
-    failed: Sequence[str] = ()  # sentences if some sets failed, or all gave the same poses
+    # Sentences if some sets failed, were not tried in time, or all gave the same poses.
+    failed: Sequence[str] = ()
     # What error costs, a row for each choice, that which is recommended first.
     front: Sequence[dict[str, Any]] = ()
 
@@ -109,7 +110,7 @@ def train(
     archive = _ready_archive(study, progress)
     config, names, space = study.config.offline, study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
-        verdicts = _searched(study, archive, workers, progress, clock)
+        verdicts, ended = _searched(study, archive, workers, progress, clock)
         finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set = ParameterSets(space, tuple(verdicts), tried)
@@ -149,7 +150,7 @@ def train(
     said += bare_in_words(archive, whole, fixed, worse)
     rows_of_front = front_rows(usable, model, left_out(judged, usable, model, worse))
     tables.write_rows(study.folder, "front", rows_of_front)
-    failed = [*unread_in_words(finished), *failed_in_words(verdicts)]
+    failed = [*ended, *unread_in_words(finished), *failed_in_words(verdicts)]
     return Training(model, trials, rows, said, failed, rows_of_front)
 
 
@@ -163,15 +164,16 @@ def _left_out(others: LabelledData, drives: Mapping[int, Summary]) -> float | No
 
 def _searched(
     study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Stopwatch
-) -> dict[int, Verdict]:
-    """Drive the baseline, say how long the rest takes, and try sets."""
+) -> tuple[dict[int, Verdict], list[str]]:
+    """Drive the baseline, say how long the rest takes, and try sets; what time has left out."""
     run_baseline(study, archive, workers, progress)
     expected, config = forecast(study, archive, len(workers.workers()), clock), study.config.offline
     left = (config.most_trials or np.inf) - min(len(archive.finished(n)) for n in study.training)
     most = 3600.0 * ((config.hours or np.inf) - clock.hours)
     if left > 0 and most > 0.0 and min(left, most) < np.inf:
         _log.info("%s", expected.words(left, most))
-    return Campaign(study, archive, workers, progress, clock, expected).run()
+    campaign = Campaign(study, archive, workers, progress, clock, expected)
+    return campaign.run(), campaign.words
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:

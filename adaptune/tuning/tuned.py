@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
     from adaptune.space import ParameterSet
     from offline.config import OfflineStudy
+    from offline.search import Stopwatch
     from offline.train import Training
     from online.compare import ComparedReplays
 
@@ -238,7 +239,7 @@ def tune_asked(
     from offline.config import load_study
     from offline.search import ELAPSED, Stopwatch
     from offline.train import odometry_rows, train
-    from online.modes import run_replays
+    from online.modes import BASELINE, FIXED, replay_modes, run_replays
 
     check_guarded("tune")
     forget_user_code()
@@ -252,9 +253,36 @@ def tune_asked(
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
-        run_replays(study, study.model_path, show)
-        of_each = odometry_rows(study, training, show, cluster)
+        of_each, fitted = list[dict[str, Any]](), (training.model, study.model_path)
+        hours, test = study.config.offline.hours, study.config.test
+        try:
+            if hours is not None:  # what decides comes first, whatever it takes
+                replay_modes(study, test, (BASELINE, FIXED), show, fitted)
+                show = _within(hours, clock, show)
+            run_replays(study, study.model_path, show)
+            of_each = odometry_rows(study, training, show, cluster)
+        except OutOfTimeError as why:
+            _log.warning("%s", why)
         return Tuned(study, training, *compared(study), more, before, of_each)
+
+
+class OutOfTimeError(AdaptuneError):
+    """Something did not fit into the time."""
+
+
+LATE = 1.05
+"""Times what is allowed, after which nothing but the comparison is done."""
+
+
+def _within(hours: float, clock: "Stopwatch", show: Progress) -> Progress:
+    """Progress with an OutOfTimeError once the time is up."""
+
+    def shown(text: str, done: float, of: int, remark: str = "", /) -> None:
+        show(text, done, of, remark)
+        if clock.hours > LATE * hours and done < of:
+            raise OutOfTimeError(f"{text}: does not fit into the time; allow more --minutes")
+
+    return shown
 
 
 def _paths(given: Paths) -> list[Path]:

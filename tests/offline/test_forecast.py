@@ -56,8 +56,3 @@ def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatc
 )
 def test_it_is_said_in_a_line(left, most, words):
     assert Forecast(10.0, 100.0).words(left, most) == words
-
-
-def test_what_banks_take_beyond_the_time_is_told():
-    said = Forecast(10.0, 100.0, over=300.0).words(32, 200.0)
-    assert said == "it takes about 8 min: 10 parameter sets of 10.0 s, and the rest"

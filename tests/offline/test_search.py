@@ -218,7 +218,10 @@ def test_no_set_begins_that_would_not_end_in_time(study_of, monkeypatch, expecte
     of_study = Stopwatch(study.folder / "elapsed.json")
     clock.seconds = 100.0  # reading the bags
     given = Archive(study.folder / "trials"), Slow(clock)
-    verdicts = Campaign(study, *given, clock=of_study, expected=Forecast(expected, 300.0)).run()
+    first = Campaign(study, *given, clock=of_study, expected=Forecast(expected, 300.0))
+    verdicts = first.run()
+    n = f"{len(verdicts)} parameter sets were tried, 1 of them the odometry's own"
+    assert first.words == [f"{n}: no more sets fit into the time."]
     assert clock.seconds == 100.0 + 30.0 * len(verdicts)
     assert 0.8 * 1500.0 <= clock.seconds + 300.0 <= 1500.0
     # Nor if the same command, again, finds that one more would fit.
@@ -232,6 +235,7 @@ def test_however_short_the_time_the_baseline_is_driven(study_file, tmp_path, cap
     study = load_study(study_file, ["offline.trials=", "offline.hours=1e-9"], tmp_path / "run")
     training = train(study)
     assert [row["trial"] for row in training.trials] == [training.model.fixed] == [0]
+    assert training.words[0].startswith("1 parameter sets were tried")
     assert "the search ends: no more sets fit into the time" in caplog.text
     assert "no other set than the baseline was tried: allow more time" in caplog.messages
 

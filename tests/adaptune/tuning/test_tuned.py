@@ -4,6 +4,7 @@ import logging
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import drives
 import fake_odometry
@@ -16,6 +17,7 @@ from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.progress import bars_and_words
 from adaptune.tuning.asked import Asked, named_odometry
+from adaptune.tuning.tuned import OutOfTimeError, _within
 
 
 @pytest.fixture(autouse=True)
@@ -131,6 +133,17 @@ def test_results_stay_where_they_are_if_the_working_folder_changes(monkeypatch, 
     adaptune.tune("some/one.bag", "kiss_icp")
     adaptune.tune(["one.bag", "two.bag"], folder="mine")
     assert given == [tmp_path / "runs/one_kiss_icp", tmp_path / "mine"]
+
+
+def test_banks_that_do_not_fit_into_the_time_are_not_replayed():
+    clock, shown = SimpleNamespace(hours=0.1), []
+    show = _within(0.2, clock, lambda *how: shown.append(how))
+    show("hall, adaptive", 1, 20)
+    clock.hours = 0.22
+    show("hall, adaptive", 20, 20)  # what is done stays
+    with pytest.raises(OutOfTimeError, match="hall, adaptive: does not fit into the time"):
+        show("hall, adaptive", 2, 20)
+    assert [how[1] for how in shown] == [1, 20, 2]
 
 
 def test_a_study_of_which_nobody_knows_how_it_was_made_is_kept():
