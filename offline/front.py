@@ -101,12 +101,12 @@ def left_out(
         if not len((blocks := tried.tracked()).errors):
             return ""
         means, _ = mean_and_error(blocks.errors, blocks.sequence)
-        least, ms = means[list(blocks.trials).index(model.fixed)], costs.alone(model.fixed)
+        least, own = means[list(blocks.trials).index(model.fixed)], costs.alone(model.fixed)
         if model.recommended == BANK:
             least *= model.expected["geometric"]
-            ms = costs.adaptive(t for t in model.bank if t not in model.reserve)
-        errors = means / max(least, 1e-9)
-        ms = np.maximum([costs.alone(t) for t in blocks.trials], LEAST_COST) / max(ms, LEAST_COST)
+            own = costs.adaptive(t for t in model.bank if t not in model.reserve)
+        errors, each = means / max(least, 1e-9), [costs.alone(t) for t in blocks.trials]
+        ms = np.maximum(each, LEAST_COST) / max(own, LEAST_COST)
         dominates = (errors <= AS_GOOD) & (ms <= AS_GOOD) & (errors * ms < CHEAPER)
         if dominates.any():
             k = int(np.argmin(np.where(dominates, errors * ms, np.inf)))

@@ -112,7 +112,8 @@ def evaluate(
         if not (one in (None, ESTIMATED) or (isinstance(one, str) and one[:1] == "/")):
             what = f"is of one recording, and there are {len(paths)}; name topics that each has"
             raise AdaptuneError(f"{name_of(one)}: {what}")
-    by, chosen = convention(extrinsic, clock_offset, pose_time), reference and str(reference)
+    by = convention(extrinsic, clock_offset, pose_time)
+    chosen = None if reference is None else str(reference)
     asked = _Asked(trajectories, chosen, sub_trajectory, by, Path(out))
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
