@@ -101,12 +101,13 @@ def left_out(
         if not len((blocks := tried.tracked()).errors):
             return ""
         means, _ = mean_and_error(blocks.errors, blocks.sequence)
-        least, ms = means[list(blocks.trials).index(model.fixed)], costs.alone(model.fixed)
+        least, cost = means[list(blocks.trials).index(model.fixed)], costs.alone(model.fixed)
         if model.recommended == BANK:
             least *= model.expected["geometric"]
-            ms = costs.adaptive(t for t in model.bank if t not in model.reserve)
+            cost = costs.adaptive(t for t in model.bank if t not in model.reserve)
         errors = means / max(least, 1e-9)
-        ms = np.maximum([costs.alone(t) for t in blocks.trials], LEAST_COST) / max(ms, LEAST_COST)
+        ms = np.maximum([costs.alone(t) for t in blocks.trials], LEAST_COST)
+        ms /= max(cost, LEAST_COST)
         dominates = (errors <= AS_GOOD) & (ms <= AS_GOOD) & (errors * ms < CHEAPER)
         if dominates.any():
             k = int(np.argmin(np.where(dominates, errors * ms, np.inf)))
