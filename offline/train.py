@@ -123,12 +123,11 @@ def train(
         judged = data.usable()
         usable = in_whole_drives(judged, archive, config, drive)
     whole = read_whole_drives(archive, names, [*usable.finalists(), *every_set.defaults])
-    fixed = usable.fixed()
+    fixed, equal_cost, any_cost = usable.front()[1:4]
     dropped = sorted({*judged.sets} - {*usable.sets})
     data = data._replace(costs=(usable.beside or data.costs).without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
-    chosen = usable.front()
-    others = {EQUAL: every_set[chosen.equal_cost], ANY: every_set[chosen.any_cost]}
+    others = {EQUAL: every_set[equal_cost], ANY: every_set[any_cost]}
     write_sets(study, every_set[fixed], others)
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
@@ -145,7 +144,6 @@ def train(
     )
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    # Others were dropped because they did not drive.
     worse = driven_bare(archive, names, dropped)
     said += bare_in_words(archive, whole, fixed, worse)
     rows_of_front = front_rows(usable, model, left_out(judged, usable, model, worse))

@@ -320,10 +320,8 @@ def compare(study: Study) -> ComparedReplays:
                 oracles.append(row)
     rows = _rows(judged, oracles)
     obstacle = ReplaySetup.of(study).obstacle(ADAPTIVE, model) if ADAPTIVE not in modes else ""
-    length, recommended = (
-        study.config.sub_trajectory,
-        "fixed" if model is None else model.recommended,
-    )
+    length = study.config.sub_trajectory
+    recommended = FIXED if model is None else model.recommended
     best = decided(rows, recommended)
     said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:

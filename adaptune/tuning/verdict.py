@@ -46,7 +46,9 @@ def front_table(
     if own is not None and own[0].exists():
         said.append(f"For the odometry's own tool: {own[0].name} ({own[1].use}).")
     if any(row["what"] == ADAPTIVE for row in rows):
-        said.append(f"On a robot: `adaptune online {study.folder} --ros2 --mode adaptive`.")
+        said.append(
+            f"The bank, on a robot: `adaptune online {study.folder} --ros2 --mode adaptive`."
+        )
     return Listing(f"{title} over {metres}", cells, " ".join(filter(None, said)))
 
 
