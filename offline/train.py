@@ -127,8 +127,7 @@ def train(
     dropped = sorted({*judged.sets} - {*usable.sets})
     data = data._replace(costs=(usable.beside or data.costs).without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
-    others = {EQUAL: every_set[equal_cost], ANY: every_set[any_cost]}
-    write_sets(study, every_set[fixed], others)
+    write_sets(study, every_set[fixed], {EQUAL: every_set[equal_cost], ANY: every_set[any_cost]})
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)

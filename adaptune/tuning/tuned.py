@@ -258,7 +258,7 @@ def tune_asked(
         try:
             if hours is not None:  # what decides comes first, whatever it takes
                 replay_modes(study, test, (BASELINE, FIXED), show, fitted)
-                show = _within(hours, clock, show)
+                show = within(hours, clock, show)
             run_replays(study, study.model_path, show)
             of_each = odometry_rows(study, training, show, cluster)
         except OutOfTimeError as why:
@@ -274,7 +274,7 @@ LATE = 1.05
 """Times what is allowed, after which nothing but the comparison is done."""
 
 
-def _within(hours: float, clock: "Stopwatch", show: Progress) -> Progress:
+def within(hours: float, clock: "Stopwatch", show: Progress) -> Progress:
     """Progress with an OutOfTimeError once the time is up."""
 
     def shown(text: str, done: float, of: int, remark: str = "", /) -> None:

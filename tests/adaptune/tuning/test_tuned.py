@@ -17,7 +17,7 @@ from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.progress import bars_and_words
 from adaptune.tuning.asked import Asked, named_odometry
-from adaptune.tuning.tuned import OutOfTimeError, _within
+from adaptune.tuning.tuned import OutOfTimeError, within
 
 
 @pytest.fixture(autouse=True)
@@ -137,7 +137,7 @@ def test_results_stay_where_they_are_if_the_working_folder_changes(monkeypatch, 
 
 def test_banks_that_do_not_fit_into_the_time_are_not_replayed():
     clock, shown = SimpleNamespace(hours=0.1), []
-    show = _within(0.2, clock, lambda *how: shown.append(how))
+    show = within(0.2, clock, lambda *how: shown.append(how))
     show("hall, adaptive", 1, 20)
     clock.hours = 0.22
     show("hall, adaptive", 20, 20)  # what is done stays
