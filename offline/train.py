@@ -426,13 +426,12 @@ def odometry_rows(
         mine = [row for row in training.trials if row[ODOMETRY] == one]
         best = min(mine, key=lambda row: (row["state"] != "complete", row["mean"] or np.inf))
         for row in mine[:1] + [best] * (best is not mine[0]):
-            about = {"odometry": one, "trial": row["trial"], "own": row is mine[0]}
-            rows.append(
-                about | {"training [%]": row["mean"], COST: row[COST], "state": row["state"]}
-            )
+            which = "its own" if row is mine[0] else f"trial {row['trial']}"
+            about = {"odometry": one, "parameters": which, "training [%]": row["mean"]}
+            rows.append(about | {COST: row[COST], "_trial": row["trial"], "_state": row["state"]})
     if not rows:
         return []
-    known = [row["trial"] for row in rows if row["state"] == "complete"]
+    known = [row["_trial"] for row in rows if row["_state"] == "complete"]
     archive, names = _on_test(study, model, known, progress, cluster, "odometries")
     pairs: dict[int, list[Pair]] = {trial: [] for trial in known}
     for name in names:
@@ -446,10 +445,11 @@ def odometry_rows(
             if both.size:
                 of.append(Pair(both, block, study.sequences.recorded_in(name)))
     for row in rows:
-        of = pairs.get(row["trial"], [])
+        of = pairs.get(row["_trial"], [])
         row["test [%]"] = float(np.mean([p.errors[0].mean() for p in of])) if of else None
         value, ends, _ = ratio(of) if of else Ratio(np.nan)
-        row |= {"vs first": value if of else None, "95 %": in_cell(ends) if of else None}
+        row[f"vs {labels[0]}'s own"] = value if of else None
+        row["95 %"] = in_cell(ends) if of else None
     return sorted(rows, key=lambda row: (row["test [%]"] is None, row["test [%]"] or 0.0))
 
 

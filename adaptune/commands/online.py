@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -28,11 +28,11 @@ from adaptune.commands.terminal import (
     show_table,
 )
 from adaptune.errors import AdaptuneError
-from adaptune.tuning.asked import Asked
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
     from online.compare import ComparedReplays
+    from online.gate import Gate
     from online.replay import ReplayRecord
 
 log = logging.getLogger(__name__)
@@ -246,10 +246,24 @@ def compare(
             raise AdaptuneError("-o, --folder and --details go with one study, not with --against")
         if not recordings and any(of_bags.values()):
             raise AdaptuneError(f"{_given(of_bags)}: goes with the bags to drive; name them, too")
-        asked = Asked(recordings or (), odometry or "", points, reference, reading=reading)
         if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
             raise AdaptuneError(f"--sub-trajectory {sub_trajectory:g}: give metres, more than 0")
-        _gate((study, against), asked, (worse, cost), sub_trajectory, unclear, out)
+        from adaptune.tuning import sides
+
+        given: dict[str, Any] = {"points": points, "reference": reference, "reading": reading}
+        given |= {"odometry": odometry or "", "sub_trajectory": sub_trajectory}
+        bounds = percent(worse, "worse"), None if cost == "off" else percent(cost, "cost")
+        with progress() as show:
+            gate = sides.compare(
+                study,
+                against,
+                recordings or (),
+                worse=bounds[0],
+                cost=bounds[1],
+                progress=show,
+                **given,
+            )
+        _say_gate(gate, unclear, out)
         return
     if any(of_both.values()):
         raise AdaptuneError(f"{_given(of_both)}: goes with --against, which names the other side")
@@ -290,22 +304,10 @@ def _given(options: Mapping[str, object]) -> str:
     return ", ".join(name for name, value in options.items() if value)
 
 
-def _gate(
-    given: tuple[str, str],
-    asked: Asked,
-    percents: tuple[str, str],
-    length: float | None,
-    unclear: str,
-    out: Path,
-) -> None:
+def _say_gate(gate: "Gate", unclear: str, out: Path) -> None:
     """Say whether the first side is worse than the second one, and exit with a code."""
-    from adaptune.tuning.sides import gated
     from online.gate import write_gate
 
-    worse, cost = percents
-    bounds = percent(worse, "worse"), None if cost == "off" else percent(cost, "cost")
-    with progress() as show:
-        gate = gated(given, asked, bounds, length, show)
     write_gate(out, gate)
     say(gate.words)
     title = f"New against old, RTE over {gate.length:g} m"

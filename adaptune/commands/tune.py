@@ -344,33 +344,20 @@ def say_odometries(tuned: "Tuned") -> None:
 
     if not (rows := tuned.of_each):
         return
-    best = rows[0]
+    best, allowed = rows[0], tuned.training.model.allowed()
     if best["test [%]"] is not None:
-        what = "its own parameters" if best["own"] else f"trial {best['trial']}"
         cost = f"{cell_text(best['test [%]'])} % at {cell_text(best[COST])} ms a scan"
-        said = f"Best odometry on the test: {best['odometry']} with {what}, {cost}."
-        allowed = tuned.training.model.allowed()
-        if allowed is not None and best["trial"] not in allowed:
-            said += " It costs more than the budget."
-        say(said)
+        dear = allowed is not None and best["_trial"] not in allowed
+        more = " It costs more than the budget." * dear
+        of = f"{best['odometry']} with {best['parameters']}".replace(
+            "its own", "its own parameters"
+        )
+        say(f"Best odometry on the test: {of}, {cost}.{more}")
     for row in rows:
-        if row["state"] != "complete":
-            say(f"Not run on the test: {row['odometry']}, trial {row['trial']}: {row['state']}.")
-    first = next(iter(tuned.study.config.odometries))
-    shown = [
-        {
-            "odometry": row["odometry"],
-            "parameters": "its own" if row["own"] else f"trial {row['trial']}",
-            "test [%]": row["test [%]"],
-            f"vs {first}'s own": row["vs first"],
-            "95 %": row["95 %"],
-            COST: row[COST],
-            "training [%]": row["training [%]"],
-        }
-        for row in rows
-    ]
+        if row["_state"] != "complete":
+            say(f"Not run on the test: {row['odometry']}, trial {row['_trial']}: {row['_state']}.")
     show_table(
         "RTE of each odometry, in trials on the test",
-        shown,
+        rows,
         "A trial goes on from the reference after an impossible motion; the modes above do not.",
     )

@@ -22,6 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.errors import Finding, blame_machine, nearest
 from adaptune.recording import clouds
+from adaptune.recording.cache import status_key
 from adaptune.recording.clouds import CLOUDS, PointCloudError, header_of
 from adaptune.recording.config import files_of
 from adaptune.recording.findings import clock_parts, of_clock
@@ -130,6 +131,11 @@ class IndexReader(Reader):
                     super().read_index_data(info.pos, indexes)
         self.indexes = {c.id: sorted(indexes[c.id]) for c in self.connections}
         yield from super().messages(connections, start, stop)
+
+
+_poses: dict[tuple[object, ...], Trajectory] = {}
+_MOST_POSES = 32
+"""Those that were read last, by files and topic, and how many of them are kept."""
 
 
 class BagSource:
@@ -319,6 +325,15 @@ class BagSource:
         if name is None:
             return None
         name = self.topic(name, POSES, "poses")
+        # They are asked for again and again, and to unpack a bag may take minutes.
+        key = (*map(status_key, self.files), name, child_frame, strict)
+        if key not in _poses:
+            if len(_poses) >= _MOST_POSES:
+                _poses.clear()
+            _poses[key] = self._poses(name, child_frame, strict)
+        return _poses[key]
+
+    def _poses(self, name: str, child_frame: str | None, strict: bool) -> Trajectory:
         messages = self.messages(name, last=self.topics[name] == PATH)
         found = [pose for message in messages for pose in POSES[message.__msgtype__](message)]
         if self.topics[name] in TRANSFORMS and "." in (child_frame or ""):

@@ -110,6 +110,8 @@ def compare(
     progress
         Called with how far each task is; by default, bars show it.
     """
+    from online.gate import compare_sides, shared_replays
+
     check_guarded("compare")
     bags = [recordings] if isinstance(recordings, str | Path) else recordings
     judge = None if reference is None else str(reference)
@@ -117,23 +119,10 @@ def compare(
     given = [str(side) if isinstance(side, Path) else side for side in (new, old)]
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
-        return gated(given, asked, (worse, cost), sub_trajectory, show)
-
-
-def gated(
-    given: Sequence[Any],
-    asked: Asked,
-    percents: tuple[float, float | None],
-    length: float | None,
-    show: Progress,
-) -> "Gate":
-    """Do what `compare` does of what was asked; `percents` are of error and of cost."""
-    from online.gate import compare_sides, shared_replays
-
-    shared = shared_replays(*sides(given, asked, length, show))
-    error, cost = percents
-    measured = None if cost is None else costs(shared, show)
-    return compare_sides(shared, measured, error / 100.0, math.inf if cost is None else cost / 100)
+        shared = shared_replays(*sides(given, asked, sub_trajectory, show))
+        measured = None if cost is None else costs(shared, show)
+    bound = math.inf if cost is None else cost / 100.0
+    return compare_sides(shared, measured, worse / 100.0, bound)
 
 
 def costs(shared: "Shared", show: Progress) -> "dict[str, Costs | str]":

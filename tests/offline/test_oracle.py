@@ -92,12 +92,14 @@ def test_each_of_several_odometries_is_run_on_the_test(study_file, tmp_path):
     rows = odometry_rows(study, training)
     tested = [row["test [%]"] for row in rows]
     assert tested == sorted(tested)
-    assert {(row["odometry"], row["own"]) for row in rows} >= {("one", True), ("two", True)}
-    own = {row["odometry"]: row for row in rows if row["own"]}
-    assert own["one"]["vs first"] == own["two"]["vs first"] == 1.0  # the same code
-    best = next(row for row in rows if not row["own"])
+    assert {(row["odometry"], row["parameters"]) for row in rows} >= {
+        (n, "its own") for n in ("one", "two")
+    }
+    own = [row["vs one's own"] for row in rows if row["parameters"] == "its own"]
+    assert own == [1.0, 1.0]  # the same code
+    best = next(row for row in rows if row["parameters"] != "its own")
     archive = study.archive("odometries")
-    errors = cap(archive.read_errors("three", [best["trial"]]))
+    errors = cap(archive.read_errors("three", [best["_trial"]]))
     assert best["test [%]"] == pytest.approx(np.nanmean(errors))
     # What is there is not run again, and a single odometry has no such rows.
     assert odometry_rows(study, training) == rows

@@ -184,23 +184,18 @@ def test_of_several_odometries_each_has_its_rows_on_the_test(monkeypatch):
     monkeypatch.setattr(
         "adaptune.commands.tune.show_table", lambda _, rows, *__: shown.extend(rows)
     )
-    row = {"vs first": 0.5, "95 %": "0.4-0.6", COST: 12.0, "training [%]": 1.0, "state": "complete"}
-    lost = {"test [%]": None, "vs first": None, "95 %": None, "state": "failed: 10 faults"}
-    of_each = [
-        row | {"odometry": "ndt", "trial": 5, "own": False, "test [%]": 0.62},
-        row | {"odometry": "gicp", "trial": 0, "own": True, "test [%]": 1.24},
-        row | {"odometry": "mine:Icp", "trial": 1, "own": True} | lost,
-    ]
-    study = SimpleNamespace(config=SimpleNamespace(odometries={"gicp": 0, "ndt": 0}))
+    row = {"parameters": "its own", COST: 12.0, "test [%]": 1.24, "_state": "complete"}
+    tuned = {"odometry": "ndt", "parameters": "trial 5", "_trial": 5, "test [%]": 0.62}
+    lost = {"odometry": "mine:Icp", "_trial": 1, "test [%]": None, "_state": "failed: 10 faults"}
+    of_each = [row | tuned, row | {"odometry": "gicp", "_trial": 0}, row | lost]
     training = SimpleNamespace(model=SimpleNamespace(allowed=lambda: (0, 1)))
-    say_odometries(SimpleNamespace(of_each=of_each, study=study, training=training))
+    say_odometries(SimpleNamespace(of_each=of_each, training=training))
     assert said == [
         "Best odometry on the test: ndt with trial 5, 0.620 % at 12.0 ms a scan. It costs more "
         "than the budget.",
         "Not run on the test: mine:Icp, trial 1: failed: 10 faults.",
     ]
-    assert [row["parameters"] for row in shown] == ["trial 5", "its own", "its own"]
-    assert shown[0]["vs gicp's own"] == 0.5
+    assert shown == of_each
     say_odometries(SimpleNamespace(of_each=()))
     assert len(said) == 2
 

@@ -4,6 +4,7 @@ import resource
 import sqlite3
 from contextlib import closing
 
+import drives
 import fuzz
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from small_bag import START, cloud, pose, texts
 
 from adaptune.errors import AdaptuneError, MachineError
 from adaptune.recording import SequenceConfig, SequenceError
-from adaptune.recording.bag import IndexReader
+from adaptune.recording.bag import BagSource, IndexReader
 from adaptune.recording.clouds import CLOUDS, LIVOX_TYPES
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
@@ -591,3 +592,16 @@ def test_a_machine_without_room_is_not_taken_for_a_damaged_scan(tmp_path, monkey
         list(opened(path))
     with pytest.raises(MachineError, match="the disk is full"):
         inspect(path)
+
+
+def test_poses_are_read_once_until_the_file_changes(tmp_path, monkeypatch):
+    reads, read = [], BagSource.read
+    monkeypatch.setattr(BagSource, "read", lambda *given: reads.append(given[2]) or read(*given))
+    path = tmp_path / "one.bag"
+    config = SequenceConfig(bag=path, points="/points", reference="/truth")
+    for n in (40, 50):
+        path.unlink(missing_ok=True)
+        drives.write_bag(path, drives.scans(n_scans=n))
+        references = [open_sequence(config).reference() for _ in range(3)]
+        assert [len(reference) for reference in references] == [n] * 3
+    assert reads.count("/truth") == 2
