@@ -3,7 +3,7 @@
 import logging
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -32,7 +32,6 @@ from adaptune.errors import AdaptuneError
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
     from online.compare import ComparedReplays
-    from online.gate import Gate
     from online.replay import ReplayRecord
 
 log = logging.getLogger(__name__)
@@ -248,22 +247,9 @@ def compare(
             raise AdaptuneError(f"{_given(of_bags)}: goes with the bags to drive; name them, too")
         if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
             raise AdaptuneError(f"--sub-trajectory {sub_trajectory:g}: give metres, more than 0")
-        from adaptune.tuning import sides
-
         given: dict[str, Any] = {"points": points, "reference": reference, "reading": reading}
         given |= {"odometry": odometry or "", "sub_trajectory": sub_trajectory}
-        bounds = percent(worse, "worse"), None if cost == "off" else percent(cost, "cost")
-        with progress() as show:
-            gate = sides.compare(
-                study,
-                against,
-                recordings or (),
-                worse=bounds[0],
-                cost=bounds[1],
-                progress=show,
-                **given,
-            )
-        _say_gate(gate, unclear, out)
+        _gate((study, against), recordings or (), (worse, cost), given, unclear, out)
         return
     if any(of_both.values()):
         raise AdaptuneError(f"{_given(of_both)}: goes with --against, which names the other side")
@@ -304,10 +290,24 @@ def _given(options: Mapping[str, object]) -> str:
     return ", ".join(name for name, value in options.items() if value)
 
 
-def _say_gate(gate: "Gate", unclear: str, out: Path) -> None:
+def _gate(
+    both: tuple[str, str],
+    recordings: Sequence[Path],
+    percents: tuple[str, str],
+    given: Mapping[str, Any],
+    unclear: str,
+    out: Path,
+) -> None:
     """Say whether the first side is worse than the second one, and exit with a code."""
+    from adaptune.tuning import sides
     from online.gate import write_gate
 
+    worse, cost = percents
+    bounds = percent(worse, "worse"), None if cost == "off" else percent(cost, "cost")
+    with progress() as show:
+        gate = sides.compare(
+            *both, recordings, worse=bounds[0], cost=bounds[1], progress=show, **given
+        )
     write_gate(out, gate)
     say(gate.words)
     title = f"New against old, RTE over {gate.length:g} m"

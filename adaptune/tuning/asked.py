@@ -10,7 +10,6 @@ from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from adaptune import processes
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name
 from adaptune.progress import Progress
@@ -149,6 +148,8 @@ def usable(path: Path, points: str | None, reference: str | None, show: Progress
 
 def check_guarded(function: str) -> None:
     """Refuse to begin again in a process that was started by the same script."""
+    from adaptune import processes  # takes long to import
+
     started = getattr(sys.modules["__main__"], "__spec__", None)
     imported = started is not None and started.name == processes.__name__
     if imported or getattr(multiprocessing.current_process(), "_inheriting", False):

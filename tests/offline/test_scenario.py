@@ -33,7 +33,7 @@ def same(one, other):
 def test_it_holds_what_the_archive_does(study):
     found = scenario(study)
     archive = Archive(study.folder / "trials")
-    assert found.performances.shape == (len(found.frame), len(found.sets)) == (42, 10)
+    assert found.performances.shape == (len(found.frame), len(found.sets)) == (58, 10)
     for name in ("one", "two"):
         here = found.sequence == name
         errors = archive.read_errors(name, list(found.sets))[found.frame[here]]
@@ -48,7 +48,7 @@ def test_it_holds_what_the_archive_does(study):
     # Two recordings are few: stretches are left out, and none is of both.
     folds = [set(found.fold[found.sequence == name]) for name in ("one", "two")]
     assert folds[0].isdisjoint(folds[1])
-    assert found.features.shape == (42, 90)
+    assert found.features.shape == (58, 90)
 
 
 class Baseline(Rule):
@@ -86,7 +86,7 @@ class Best(Baseline):
 
 
 def errors(found, rule):
-    return cap(found.performances)[np.arange(42), found.select(rule)]
+    return cap(found.performances)[np.arange(58), found.select(rule)]
 
 
 def test_a_table_of_rules_has_what_they_compare_with(study):
@@ -128,11 +128,11 @@ def test_rules_are_scored_without_an_odometry(study):
     with pytest.raises(AdaptuneError, match=r"Cheapest: is a class; give an object, Cheapest\(\)"):
         found.score(Cheapest)
     near = errors(found, NearestNeighbours(k=3))
-    assert near.shape == (42,)
+    assert near.shape == (58,)
     assert np.isin(near, cap(found.performances)).all()
     with pytest.raises(AdaptuneError, match=r"Best\.select: ValueError: not enough values"):
         found.score(Best())
-    for folds in (np.zeros(42, np.intp), np.arange(42) % 2):
+    for folds in (np.zeros(58, np.intp), np.arange(58) % 2):
         with pytest.raises(AdaptuneError, match="nothing is left to learn from"):
             found._replace(fold=folds).score(Baseline())
 

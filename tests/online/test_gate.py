@@ -23,7 +23,9 @@ def paired(i, *, ratio=1.0, restarts=(0, 0), lost=(0, 0), recording=None, seed=0
 
 
 def judge(pairs, costs=None):
-    side = SimpleNamespace(name="side")
+    config = SimpleNamespace(sub_trajectory=2.0)
+    study = SimpleNamespace(odometry=SimpleNamespace(name="gicp"), config=config)
+    side = SimpleNamespace(name="side", study=study)
     return compare_sides(Shared(side, side, "baseline", pairs, ""), costs, 0.05, 0.1)
 
 

@@ -174,7 +174,7 @@ def test_the_command_line_names_what_follows(study_file, tmp_path):
     words = [study_file, "--folder", tmp_path / "run"]
     assert "2 replays made" in succeeded("online", *words, "--untrained").stdout
     done = succeeded("compare", *words)
-    made = list((tmp_path / "run").rglob("comparison.csv"))
+    made = (tmp_path / "run").rglob("comparison/comparison.csv")
     # A narrow terminal breaks the names of columns.
     assert ["vs baseline" in path.read_text("utf-8") for path in made] == [True]
     assert "fixed.yaml" not in done.stdout

@@ -288,7 +288,7 @@ def test_where_every_set_is_lost_it_is_said_first(make):
     assert said[0].startswith(
         "Even with the fixed set, the best of 2 parameter sets, track is lost on one: "
     )
-    assert "compare with `gicp`" in said[0]
+    assert "gicp holds track on one" in said[0]
 
 
 def test_with_the_baseline_s_parameters_something_else_than_these_is_wrong(make):
