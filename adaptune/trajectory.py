@@ -20,12 +20,9 @@ from numpy.typing import NDArray
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.geometry import Poses, invert, scale
+from adaptune.geometry import Poses
 
 _log = logging.getLogger(__name__)
-_BESIDE = 0.6
-"""Share of a step up to which a pose goes on into a gap: the pose of a scan may be of its middle,
-and so the first one after a gap lies in it."""
 
 
 class TrajectoryError(AdaptuneError):
@@ -76,7 +73,7 @@ class Trajectory:
         """Poses of shape (m, 4, 4) at m stamps: linear in translation, spherical in rotation.
 
         They are NaN outside the trajectory, and between poses further apart than `max_gap` seconds,
-        by default its own, but for what is `_BESIDE` a pose there.
+        by default its own.
         """
         T = np.full((len(stamps), 4, 4), np.nan)
         if not len(self) or not len(stamps):
@@ -102,21 +99,7 @@ class Trajectory:
             share = ((query - seconds[left]) / (seconds[left + 1] - seconds[left]))[:, None]
             positions = self.T_world_sensor[:, :3, 3]
             T[between, :3, 3] = (1.0 - share) * positions[left] + share * positions[left + 1]
-        for i in np.flatnonzero(inside & ~exact & ~between):
-            T[i] = self._beside_gap(int(stamps[i]), int(after[i]), gap)
         return T
-
-    def _beside_gap(self, stamp: int, after: int, gap: int) -> Poses:
-        """The pose at a stamp in a gap, by the motion beside it; NaN if that is far."""
-        for near, other in ((after - 1, after - 2), (after, after + 1)):
-            if not 0 <= other < len(self):
-                continue
-            since, step = (int(at - self.stamps[near]) for at in (stamp, self.stamps[other]))
-            if abs(since) <= _BESIDE * abs(step) and abs(step) <= gap:
-                T_near = self.T_world_sensor[near]
-                T_near_other = invert(T_near) @ self.T_world_sensor[other]
-                return np.asarray(T_near @ scale(T_near_other, since / step))
-        return np.full((4, 4), np.nan)
 
 
 Row = tuple[int, list[str]]

@@ -270,13 +270,3 @@ def test_any_text_gives_a_trajectory_or_an_error(tmp_path_factory, text):
 def test_a_sparse_trajectory_says_what_to_set(seconds, help_):
     stamps = np.round(np.arange(12) * seconds * 1e9).astype(np.int64)
     assert re.search(help_, Trajectory(stamps, np.tile(np.eye(4), (12, 1, 1))).sparse)
-
-
-def test_beside_a_gap_poses_go_on_for_half_a_step():
-    seconds = np.array([0.0, 0.1, 0.2, 3.2, 3.3])
-    T = np.tile(np.eye(4), (5, 1, 1))
-    T[:, 0, 3] = seconds**2  # it gets faster, also in the gap
-    trajectory = Trajectory(np.round(seconds * 1e9).astype(np.int64), T)
-    at = np.array([0.25, 0.3, 3.1, 3.15], np.float64)
-    found = trajectory.at(np.round(at * 1e9).astype(np.int64))[:, 0, 3]
-    np.testing.assert_allclose(found, [0.055, np.nan, np.nan, 3.2**2 - 0.325])
