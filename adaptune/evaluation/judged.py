@@ -45,22 +45,15 @@ class Judge(NamedTuple):
         All others go straight between theirs. In each gap of the judge lies one more, where nothing
         is known: no sub-trajectory crosses it.
         """
-        mine = self.trajectory.stamps
-        begin, end = (side([mine, *(o.stamps for o in others)]) for side in (_latest, _earliest))
-        every = [s[(s >= begin) & (s <= end)] for s in (mine, *(o.stamps for o in others))]
-        gaps = np.flatnonzero(np.diff(mine) > self.trajectory.max_gap * 1e9)
-        middle = (mine[gaps] // 2 + mine[gaps + 1] // 2)[: len(every[0])]
-        stamps = np.union1d(min(every, key=len), middle[(middle > begin) & (middle < end)])
+        every = [self.trajectory.stamps, *(other.stamps for other in others)]
+        begin, end = max(one[0] for one in every), min(one[-1] for one in every)
+        within = [one[(one >= begin) & (one <= end)] for one in every]
+        gaps = np.diff(every[0]) > self.trajectory.max_gap * 1e9
+        middle = (every[0][:-1] + np.diff(every[0]) // 2)[gaps]
+        middle = middle[(middle > begin) & (middle < end)]
+        stamps = np.union1d(min(within, key=len), middle)
         known = [np.isfinite(other.at(stamps)[:, 0, 0]) for other in others]
         return np.asarray(stamps[np.all(known, axis=0) | np.isin(stamps, middle)])
-
-
-def _latest(stamps: Sequence[NDArray[np.int64]]) -> int:
-    return max(int(one[0]) for one in stamps)
-
-
-def _earliest(stamps: Sequence[NDArray[np.int64]]) -> int:
-    return min(int(one[-1]) for one in stamps)
 
 
 @dataclass(frozen=True, eq=False)
