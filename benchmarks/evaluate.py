@@ -190,6 +190,9 @@ def report(found: dict[str, dict[str, Any]]) -> None:
                 print(f"rank correlation, {title}, {judge}: {least}, {len(known)} courses")
     rows = [row for one in found.values() for row in one["rows"]]
     known = [row for row in rows if row["interval"] is not None]
+    if not known:
+        print("no interval: the courses are too short")
+        return
     inside = [row["interval"][0] <= row["true"] <= row["interval"][1] for row in known]
     width = [row["interval"][1] / max(row["interval"][0], 1e-3) for row in known]
     below = np.mean([row["interval"][0] == 0.0 for row in known])
