@@ -54,20 +54,16 @@ def worse_without(blocks: BlockErrors) -> NDArray[np.bool_]:
     return np.asarray(surely_worse(blocks) | (lost > lost[blocks.baseline]))
 
 
-def driven_bare(archive: Archive, names: Sequence[str], trials: Sequence[int]) -> list[int]:
-    """Those of some trials that drove a whole recording without the health check."""
-    bare = read_whole_drives(archive, names, trials, bare=True)
-    return [n for n in trials if any(n in of for of in bare.values())]
-
-
-def bare_in_words(archive: Archive, whole: Finished, fixed: int, worse: Sequence[int]) -> list[str]:
+def bare_in_words(
+    archive: Archive, whole: Finished, fixed: int, dropped: Sequence[int]
+) -> tuple[list[str], list[int]]:
     """What fixed set and baseline do without the health check, if that is another thing.
 
-    Others are `worse`: they were left out because of what they do so.
+    Beside it: which of the sets that were `dropped` are surely worse so. Others did not drive.
     """
-    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed, *worse], bare=True)
+    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed, *dropped], bare=True)
     if not any(bare.values()):
-        return []
+        return [], []
     base, of_fixed = (
         np.mean([bare[name].get(n, of[n]).mean_error for name, of in whole.items()])
         for n in (BASELINE, fixed)
@@ -77,6 +73,6 @@ def bare_in_words(archive: Archive, whole: Finished, fixed: int, worse: Sequence
     driven = all(fixed in bare[name] or not of[fixed].restarts for name, of in whole.items())
     if fixed != BASELINE and driven:
         said += f", the fixed set {of_fixed:.3f} %"
-    if worse:
+    if worse := [n for n in dropped if any(n in of for of in bare.values())]:
         said += f"; surely worse, and not recommended: trial {', '.join(map(str, worse))}"
-    return [f"{said}."]
+    return [f"{said}."], worse

@@ -35,7 +35,7 @@ from adaptune.study.references import (
     estimates_of,
 )
 from adaptune.study.study import FIXED_SET
-from offline.bare import bare_in_words, driven_bare, in_whole_drives
+from offline.bare import bare_in_words, in_whole_drives
 from offline.campaign import (
     Campaign,
     Schedule,
@@ -143,8 +143,8 @@ def train(
     )
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    worse = driven_bare(archive, names, dropped)
-    said += bare_in_words(archive, whole, fixed, worse)
+    of_bare, worse = bare_in_words(archive, whole, fixed, dropped)
+    said += of_bare
     rows_of_front = front_rows(usable, model, left_out(judged, usable, model, worse))
     tables.write_rows(study.folder, "front", rows_of_front)
     failed = [*ended, *unread_in_words(finished), *failed_in_words(verdicts)]

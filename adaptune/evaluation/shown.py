@@ -8,7 +8,7 @@ import numpy as np
 
 from adaptune.evaluation.judged import Judged
 from adaptune.geometry import nearest_rotation
-from adaptune.paired import Ratio
+from adaptune.paired import Ratio, in_cell
 from adaptune.reference.diagnosis import OWN_ERROR
 from adaptune.reference.judge import columns_of
 from adaptune.report.charts import Axis, Chart, Line, Panel, Points
@@ -92,7 +92,7 @@ def tables(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[Listing]
     ]
     rows = [
         {"trajectory": p.better, "against": p.other, "ratio": p.ratio.value}
-        | {"95 %": p.ratio.interval and "{:.2f}-{:.2f}".format(*p.ratio.interval)}
+        | {"95 %": in_cell(p.ratio.interval)}
         for p in pairs
     ]
     return [

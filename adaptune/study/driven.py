@@ -32,12 +32,12 @@ def another_odometry(study: Study, name: str) -> tuple[str, float]:
     own = {one.name for one in study.config.odometries.values()}
     other = "kiss_icp" if "gicp" in own else "gicp"
     scans, stamps, T_odom_sensor = study.sequences.open(name), [], []
+    if (reference := scans.reference()) is None:
+        return other, math.inf
     tracker = Tracker(InProcess(odometry_class(other)()), study.config.health)
     for scan in islice(scans, MOST_SCANS):
         stamps.append(scan.stamp)
         T_odom_sensor.append(tracker.register(scan).T_odom_sensor)
-    if (reference := scans.reference()) is None:
-        return other, math.inf
     T_ref_sensor = reference.at(np.array(stamps))
     errors = sub_trajectory_rte(T_ref_sensor, np.array(T_odom_sensor), study.config.sub_trajectory)
     known = cap(errors)[~np.isnan(errors)]

@@ -130,11 +130,14 @@ class StudySequences:
     @cached_property
     def _copies(self) -> dict[str, str]:
         """By recordings that hold scans of another one, as where they are cut from it, that one."""
-        each, found = {_source_of(one): one for one in self.recordings.values()}, dict[str, str]()
-        for (first, one), (copy, other) in combinations(each.items(), 2):
+        each = {_source_of(one): one for one in self.recordings.values()}
+        opened, found = dict[str, RecordedSequence](), dict[str, str]()
+        for name in each if len(each) > 1 else ():
             with contextlib.suppress(AdaptuneError):  # who opens it is told
-                both = [RecordedSequence(c.model_copy(update=_WHOLE)) for c in (one, other)]
-                if both[0].shares_scans(both[1]):
+                opened[name] = RecordedSequence(each[name].model_copy(update=_WHOLE))
+        for (first, one), (copy, other) in combinations(opened.items(), 2):
+            with contextlib.suppress(AdaptuneError):
+                if one.shares_scans(other):
                     found.setdefault(copy, found.get(first, first))
         return found
 

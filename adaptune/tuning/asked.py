@@ -82,10 +82,15 @@ def check_no_study(path: Path) -> None:
         )
 
 
-def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
-    """The recordings by the names of their sequences, and the names of those for the test."""
+def recorded(
+    asked: Asked, show: Progress, alike: bool = True
+) -> "tuple[dict[str, Inspection], list[str]]":
+    """The recordings by the names of their sequences, and the names of those for the test.
+
+    They are `alike`, see `check_alike`, where they tune one odometry.
+    """
     from adaptune.recording.config import NO_REFERENCE
-    from adaptune.recording.fleet import recordings_at
+    from adaptune.recording.fleet import check_alike, recordings_at
 
     for path in asked.recordings:
         check_no_study(path)
@@ -109,6 +114,8 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
             f"its own; write a study file, see docs/your-bag.md"
         )
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
+    if alike:
+        check_alike(inspections)
     named = by_name(inspections)
     return named, list(named)[len(paths) - len(tested) :]
 

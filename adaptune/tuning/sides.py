@@ -162,7 +162,7 @@ def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> "list[Offline
     from adaptune.study.references import ensure_references
     from offline.config import load_study
 
-    named, _ = recorded(asked, show)
+    named, _ = recorded(asked, show, alike=False)  # nothing is tuned on them
     names = list(named)
     shared: dict[str, Any] = {
         "sequences": {name: one.given for name, one in named.items()},

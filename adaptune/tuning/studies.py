@@ -173,7 +173,6 @@ def _decided(
 ) -> dict[str, Any]:
     """The study of some recordings; nothing is written but references."""
     from adaptune.odometry.registry import declare
-    from adaptune.recording.fleet import check_alike
     from offline.config import load_study
 
     about = {name: manifest.plain(given) for name, given in asked.about.items()}
@@ -181,7 +180,6 @@ def _decided(
         # A wrong one is known before all is read.
         declare(name, about.get(name, {}).get("settings", {}))
     named, test = recorded(asked, show)
-    check_alike([*named.values()])
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
     if asked.config is not None and about:
         raise AdaptuneError("config: give it in the object's settings, or name its class")
@@ -222,7 +220,7 @@ def _decided(
 def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     """Add the recordings that a study does not name yet to where they belong; their names."""
     from adaptune.recording.config import SOURCES
-    from adaptune.recording.fleet import check_alike, recordings_at
+    from adaptune.recording.fleet import recordings_at
 
     try:
         document = Document.of_file(path)
@@ -240,7 +238,6 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     if not new:
         return []
     named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"), show)
-    check_alike([*named.values()])
     undo_motion([*named.values()], odometries_of(asked.odometry, False))
     added = {name: recording for name, recording in named.items() if recording.path in new}
     if taken := [name for name in added if name in data["sequences"]]:
@@ -431,12 +428,9 @@ def proposed_system(asked: Asked, folder: Path | None, show: Progress) -> Path |
     if (settings := _system_of(asked.odometry)) is None:
         return None
     path = (folder or Path()) / f"{plain_name(asked.recordings[0].resolve())}_ros2.yaml"
-    from adaptune.recording.fleet import check_alike
-
     if path.exists():
         raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
     named, test = recorded(asked, show)
-    check_alike([*named.values()])
     settings |= {
         "template": str(asked.config.resolve()) if asked.config else LACKING,
         "odometry": f"/{LACKING}",

@@ -2,22 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rooms import straight, trajectory
 
 from adaptune.metrics import KittiError, kitti_error
 from adaptune.reference.judge import Reference, StandardErrors
-from adaptune.trajectory import Trajectory, read_kitti
+from adaptune.trajectory import read_kitti
 from online.compare import pooled
 from online.statistics import ComparisonRow, JudgedModes
-
-
-def trajectory(T, first=0):
-    return Trajectory(np.arange(first, first + len(T)) * 10**8, T)
-
-
-def straight(n, step=1.0):
-    T = np.tile(np.eye(4), (n, 1, 1))
-    T[:, 0, 3] = step * np.arange(n)
-    return T
 
 
 def over_all(rows):

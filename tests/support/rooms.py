@@ -1,8 +1,9 @@
-"""Made-up places of a few thousand points that a hop can be registered in."""
+"""Made-up places of a few thousand points that a hop can be registered in, and paths."""
 
 import numpy as np
 
 from adaptune.recording.scan import Scan
+from adaptune.trajectory import Trajectory
 
 REACH = 18.0
 
@@ -55,3 +56,13 @@ def along_x(x):
 def write_kitti(path, T):
     """Write poses as KITTI has them, 12 numbers a line."""
     np.savetxt(path, T[:, :3].reshape(-1, 12), fmt="%.9e")
+
+
+def trajectory(T, first=0):
+    return Trajectory(np.arange(first, first + len(T)) * 10**8, T)
+
+
+def straight(n, step=1.0):
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, 0, 3] = step * np.arange(n)
+    return T

@@ -595,10 +595,15 @@ def test_a_machine_without_room_is_not_taken_for_a_damaged_scan(tmp_path, monkey
 
 
 def test_poses_are_read_once_until_the_file_changes(tmp_path, monkeypatch):
-    reads, read = [], BagSource.read
-    monkeypatch.setattr(BagSource, "read", lambda *given: reads.append(given[2]) or read(*given))
+    reads, read = [], BagSource.messages
+
+    def counted(source, topic, **given):
+        reads.append(topic)
+        return read(source, topic, **given)
+
+    monkeypatch.setattr(BagSource, "messages", counted)
     path = tmp_path / "one.bag"
-    config = SequenceConfig(bag=path, points="/points", reference="/truth")
+    config = SequenceConfig(bag=str(path), points="/points", reference="/truth")
     for n in (40, 50):
         path.unlink(missing_ok=True)
         drives.write_bag(path, drives.scans(n_scans=n))

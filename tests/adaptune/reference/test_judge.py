@@ -1,18 +1,8 @@
 import numpy as np
 import pytest
+from rooms import straight, trajectory
 
 from adaptune.reference.judge import Reference
-from adaptune.trajectory import Trajectory
-
-
-def trajectory(T, first=0):
-    return Trajectory(np.arange(first, first + len(T)) * 10**8, T)
-
-
-def straight(n, step=1.0):
-    T = np.tile(np.eye(4), (n, 1, 1))
-    T[:, 0, 3] = step * np.arange(n)
-    return T
 
 
 def test_errors_of_the_last_seconds_stand_where_their_sub_trajectories_end():
