@@ -18,6 +18,7 @@ from adaptune.paired import Ratio, ratio
 from adaptune.reference.check import hard_to_track
 from adaptune.reference.judge import StandardErrors
 from adaptune.report import tables as report
+from adaptune.space import ODOMETRY
 from adaptune.study.config import ALSO
 from adaptune.study.driven import PER_STRETCH, another_odometry
 from adaptune.study.oracle import oracle_errors
@@ -330,7 +331,8 @@ def compare(study: Study) -> ComparedReplays:
     front = choices(rows, _front(study, model), advised, obstacle)
     if advised != NONE:
         tried = 0 if model is None else len(model.sets)
-        said += verdict(rows, length, recommended, front, obstacle, tried)
+        whose = {} if model is None else _odometries(model)
+        said += verdict(rows, length, recommended, front, obstacle, tried, whose)
         said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
@@ -338,6 +340,12 @@ def compare(study: Study) -> ComparedReplays:
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
     return ComparedReplays(rows, said, details, advised, compared.unfinished, front, model)
+
+
+def _odometries(model: ErrorModel) -> dict[str, str]:
+    """Of several odometries, those that baseline and fixed set drive."""
+    both = {BASELINE: model.sets[rules.BASELINE], FIXED: model.sets[model.fixed]}
+    return {mode: str(one[ODOMETRY]) for mode, one in both.items() if ODOMETRY in one}
 
 
 def _of_one_set(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:

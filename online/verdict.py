@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from adaptune.model.registry import ADAPTIVE
@@ -125,14 +126,17 @@ def verdict(
     front: Sequence[Mapping[str, Any]] = (),
     obstacle: str = "",
     tried: int = 0,
+    odometries: Mapping[str, str] = MappingProxyType({}),
 ) -> list[str]:
     """What to do, and why, in at most five sentences.
 
     Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres.
     Training `tried` so many sets, and recommends a mode; the `front` is that of `choices`;
-    `obstacle` says why nothing adapts.
+    `obstacle` says why nothing adapts; of several `odometries`, it says which a mode drives.
     """
-    last = _judged(rows)
+    last, whose = _judged(rows), CALLED[BASELINE]
+    if BASELINE in odometries:
+        whose = f"{odometries[BASELINE]}'s own parameters"
     if (best := decided(rows, recommended)) is None:
         nobody = "No test sequence has a reference"
         known = [row for row in rows if row.reference != "none" and row.sequence != ALL]
@@ -147,12 +151,14 @@ def verdict(
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
     where = f"RTE over {length:g} m, {_where(rows)}{judge}"
     if best is base:
-        said = [f"Keep {CALLED[BASELINE]}: {_error_and_cost(best)} ({where})."]
+        said = [f"Keep {whose}: {_error_and_cost(best)} ({where})."]
         said += _why_kept(best, last, recommended, tried)
     else:
-        what = called(best.mode) + (f" (trial {trial})" if best.mode == FIXED and trial else "")
+        named = [odometries[best.mode]] if best.mode in odometries else []
+        named += [f"trial {trial}"] if best.mode == FIXED and trial else []
+        what = called(best.mode) + (f" ({', '.join(named)})" if named else "")
         gained = [f"{_error_and_cost(best)} ({where})."]
-        gained = gained if base is None else _gained(best, base, where, own)
+        gained = gained if base is None else _gained(best, base, where, own, whose)
         said = [f"Drive {what}: {gained[0]}", *gained[1:]]
     if bank := last.get(ADAPTIVE):
         gains = bank is not best and _ratio(bank).value < 1.0
@@ -171,10 +177,14 @@ def _error_and_cost(row: ComparisonRow) -> str:
 
 
 def _gained(
-    best: ComparisonRow, base: ComparisonRow, where: str, own: Mapping[str, Any] | None
+    best: ComparisonRow,
+    base: ComparisonRow,
+    where: str,
+    own: Mapping[str, Any] | None,
+    whose: str,
 ) -> list[str]:
     """What is advised gives instead of the baseline, here and on another drive."""
-    said = f"{best.rte:.3f} % instead of {base.rte:.3f} % with {CALLED[BASELINE]}"
+    said = f"{best.rte:.3f} % instead of {base.rte:.3f} % with {whose}"
     if best.cpu_ms and base.cpu_ms:
         said += f", for {best.cpu_ms:.1f} instead of {base.cpu_ms:.1f} ms a scan"
     ratio = _to_baseline(best)
@@ -202,7 +212,10 @@ def _why_kept(
 def _to_yardstick(row: ComparisonRow, last: Mapping[str, ComparisonRow], whose: str = "") -> str:
     """Error and CPU time of a mode, in times those of the fixed set, or the baseline."""
     whose, other = whose or f"the {YARDSTICKS[row.yardstick]}'s", last[row.yardstick].cpu_ms
-    said = f"{_ratio(row).value:.2f} times {whose} error ({_interval(_ratio(row))})"
+    ratio = _ratio(row)
+    said = f"{ratio.value:.2f} times {whose} error ({_interval(ratio)})"
+    if ratio.interval and ratio.interval[1] - ratio.interval[0] < ROUNDING:
+        said = f"exactly {whose} error, as it drove the same set"
     times = f", for {row.cpu_ms / other:.1f} times the CPU time" if row.cpu_ms and other else ""
     return said + times
 

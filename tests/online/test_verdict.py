@@ -59,6 +59,24 @@ def said_of(rows, recommended="fixed", of_training=None, obstacle=""):
     return verdict(rows, 10.0, recommended, found, obstacle, tried=32)
 
 
+def test_of_several_odometries_the_verdict_names_those_that_drive():
+    whose = {"baseline": "gicp", "fixed": "kiss_icp"}
+    found = choices(every(), front(), "fixed")
+    assert verdict(every(), 10.0, "fixed", found, odometries=whose)[0].startswith(
+        "Drive the fixed set (kiss_icp, trial 7): 1.000 % instead of 2.000 % with gicp's own para"
+    )
+    kept = verdict(every(baseline=0.8), 10.0, "fixed", odometries=whose)
+    assert kept[0].startswith("Keep gicp's own parameters: 0.800 %")
+
+
+def test_what_drives_the_fixed_set_alone_is_said_so():
+    rows = rows_of("a", adaptive=1.0)
+    same = [*rows[:-1], replace(rows[-1], ratio_interval=(1.0, 1.0))]
+    assert verdict(same, 10.0)[-1].startswith(
+        "Adapting: exactly the fixed set's error, as it drove the same set"
+    )
+
+
 def test_what_to_drive_and_what_adapting_adds():
     assert said_of(every(adaptive=0.8)) == [
         "Drive the fixed set (trial 7): 1.000 % instead of 2.000 % with the odometry's own "
