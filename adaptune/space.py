@@ -482,6 +482,10 @@ def load_space(data: Mapping[str, Any]) -> ParameterSpace:
     return ParameterSpace.load(data)
 
 
+State = Literal["unknown", "good", "doubtful", "lost"]
+"""Whether to believe a pose."""
+
+
 class Selection(NamedTuple):
     """A parameter set, or in a bank the weights of its members.
 
@@ -503,8 +507,10 @@ class Selection(NamedTuple):
     estimated_error, estimated_low, estimated_high : float
         Percent, the odometry's own error over the last metres as it was measured without ground
         truth, and its 95 % interval; NaN where nothing was measured.
-    lost : bool
-        Whether the last measurements say that the odometry, or the bank, has lost track.
+    state : str
+        Whether to believe the pose: unknown, good, doubtful or lost, see `adaptune.live.monitor`.
+    why : str
+        What speaks against it, in words.
     restart : frozenset of int
         Trial numbers of members of a bank that have lost track: they start again at its pose.
     resting : frozenset of int
@@ -520,6 +526,12 @@ class Selection(NamedTuple):
     estimated_error: float = math.nan
     estimated_low: float = math.nan
     estimated_high: float = math.nan
-    lost: bool = False
+    state: State = "unknown"
+    why: str = ""
     restart: frozenset[int] = frozenset()
     resting: frozenset[int] = frozenset()
+
+    @property
+    def lost(self) -> bool:
+        """Whether the odometry, or the bank, has lost track."""
+        return self.state == "lost"

@@ -292,6 +292,21 @@ class RosMessages:
             transforms=[stamped(self.header(stamp), child, transform)]
         )
 
+    def diagnostics(
+        self, stamp: int, name: str, level: int, message: str, values: Mapping[str, str]
+    ) -> Any:
+        """diagnostic_msgs/DiagnosticArray of one status."""
+        pair = self._types["diagnostic_msgs/msg/KeyValue"]
+        status = self._types["diagnostic_msgs/msg/DiagnosticStatus"](
+            level=level,
+            name=f"adaptune: {name}",
+            message=message,
+            hardware_id="",
+            values=[pair(key=key, value=value) for key, value in values.items()],
+        )
+        array = self._types["diagnostic_msgs/msg/DiagnosticArray"]
+        return array(header=self.header(stamp), status=[status])
+
     def selection(self, stamp: int, selection: Selection, why_not: str) -> Any:
         """std_msgs/String with JSON: what was selected."""
         found = {
@@ -302,6 +317,11 @@ class RosMessages:
             "predicted_error": _number(selection.predicted_error),
             "predicted_fixed": _number(selection.predicted_fixed),
             "estimated_error": _number(selection.estimated_error),
+            "estimated_low": _number(selection.estimated_low),
+            "estimated_high": _number(selection.estimated_high),
+            "unit": "percent of the way",
+            "state": selection.state,
+            "why": selection.why or None,
             "lost": selection.lost,
             "why_not": why_not or None,
         }

@@ -255,7 +255,8 @@ def _lost_seconds(replay: ReplayRecord) -> float:
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
 _PREDICTED = ("predicted_error_percent", "predicted_fixed_percent", "familiarity")
 _NUMBERS = ("trial", *_PREDICTED, *_ESTIMATED, "lost", "ms")
-SELECTION_COLUMNS = ("stamp_ns", *_NUMBERS[:-1], "weights", "ms", "why_not", "fallen_back")
+_TEXTS = ("why_not", "fallen_back", "state")
+SELECTION_COLUMNS = ("stamp_ns", *_NUMBERS[:-1], "weights", "ms", *_TEXTS)
 """Columns of ``selections.csv`` before the parameters."""
 FRAME_COLUMNS = ("stamp_ns", "registered", "restarted", "prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv``."""
@@ -270,7 +271,7 @@ def selection_row(choice: Choice, names: Sequence[str]) -> list[Any]:
     return [
         *(stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)),
         " ".join(f"{trial}:{weight:.3f}" for trial, weight in weights),
-        *(f"{1e3 * seconds:.3f}", why_not, fallen_back),
+        *(f"{1e3 * seconds:.3f}", why_not, fallen_back, selection.state),
         *(selection.parameters.get(name, "") for name in names),
     ]
 
@@ -302,9 +303,8 @@ def _applied(columns: Mapping[str, list[str]], n: int) -> dict[str, list[str]]:
     if len(rows) != n:
         raise ValueError("not a row for every selection")
     last = {columns["stamp_ns"][i]: i for i in rows}.values()
-    texts = ("why_not", "fallen_back")
     return {
-        name: [values[i] for i in last] for name, values in columns.items() if name not in texts
+        name: [values[i] for i in last] for name, values in columns.items() if name not in _TEXTS
     }
 
 

@@ -56,8 +56,8 @@ class Driver:
         odometry: OdometryInstance,
         health: HealthCheck,
         fixed: Selection | None,
-        what: str,
-        note: Callable[[Choice], None],
+        what: str = "the drive",
+        note: Callable[[Choice], None] = lambda _: None,
     ):
         self._odometry, self._fixed, self._what, self._note = odometry, fixed, what, note
         self._tracker = Tracker(odometry, health, None if fixed is None else self._unhealthy)
@@ -67,8 +67,8 @@ class Driver:
         self._first: int | None = None  # stamp
         self._avoided: dict[int, int] = {}  # until when, by trial
 
-    def take(self, stamp: int, selection: Selection, seconds: float) -> None:
-        """Apply a selection, before the scan of this stamp is registered."""
+    def take(self, stamp: int, selection: Selection, seconds: float = 0.0) -> None:
+        """Apply a selection, before the scan of this stamp is registered; it took so long."""
         choice = Choice(stamp, selection, seconds)
         if selection.weights is None and stamp < self._avoided.get(selection.trial, stamp):
             self._note(choice._replace(why_not="the odometry failed with it"))
@@ -169,7 +169,7 @@ class Driver:
         lost = choice.selection.lost
         if lost != (self._applied is not None and self._applied.lost):
             who = "odometry" if choice.selection.weights is None else "bank"
-            does = "is lost" if lost else "goes on"
+            does = f"is lost ({choice.selection.why})" if lost else "goes on"
             _log.warning(
                 "%s: the %s %s at %.1f s", self._what, who, does, self._seconds(choice.stamp)
             )

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from adaptune.commands import evaluate, offline, online, tune
+from adaptune.commands import evaluate, offline, online, tune, watch
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -28,7 +28,7 @@ app = typer.Typer(
 for _command in (
     *(tune.tune, tune.inspect, evaluate.evaluate, offline.simulate, offline.reference),
     *(offline.offline, offline.trials, offline.validate, offline.cost),
-    *(online.online, online.compare, online.record),
+    *(online.online, online.compare, online.record, watch.watch),
     offline.import_rustle,
 ):
     app.command()(_command)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert, rectify, rotation_angle
+from adaptune.geometry import Poses, invert, rectify
 from adaptune.live.hops import (
     LENGTHS,
     NEW_GUESS,
@@ -18,9 +18,11 @@ from adaptune.live.hops import (
     HopErrors,
     Hops,
     LiveSquares,
+    apart,
     live_squares,
     register,
 )
+from adaptune.live.monitor import HOPS_TO_BE_LOST, Health, HealthMonitor
 from adaptune.live.own_error import CONTRADICTED, FAMILIAR, OWN_SECONDS, Link, OwnError, OwnErrors
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
@@ -35,15 +37,11 @@ SELDOM = 50
 """Scans from one measurement to the next where nothing is in doubt: five seconds of most sensors.
 The odometry costs as much a scan, whatever the sensor's rate."""
 USUAL_SHARE = 0.4  # about the share of the seconds in which a bank measures
-HOPS_TO_BE_LOST = 2
-"""Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
 _GUESSES = 3
 _TRY_AGAIN = 5  # after so many shorter hops, a long one is tried again
 SHARED = 1.25
 """A hop may be this many times as long if it starts at a cloud that was prepared before."""
 _MIN_DIRECTIONS = 1.5  # a hop must tell the motion in two directions at least
-_FULL_TURN = 10.0
-"""Metres at which a difference in rotation counts as one in translation, in radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +94,8 @@ class LiveEvidence:
         self._newest: _Anchor | None = None
         self._short = self._since = self._n_starts = 0
         self._restarted = 0  # stamp of the scan of the last restart
+        self._monitor = HealthMonitor()
+        self._rejected = 0  # hops in a row
         self._begin()
 
     def forget(self) -> None:
@@ -111,13 +111,12 @@ class LiveEvidence:
     def _forget_errors(self) -> None:
         n = 1 + len(self.members)
         self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
-        # Hops in a row that were rejected, and by which each was wrong.
-        self._rejected, self._wrong = 0, np.zeros(n, np.intp)
+        self._wrong = np.zeros(n, np.intp)  # hops in a row by which each was wrong
 
     @property
-    def lost(self) -> bool:
-        """Whether the last hops say that the odometry, or the bank, has lost track."""
-        return bool(max(self._rejected, self._wrong[0]) >= HOPS_TO_BE_LOST)
+    def health(self) -> Health:
+        """Whether to believe the odometry, or the bank."""
+        return self._monitor.health(int(self._wrong[0]), self._rejected)
 
     def due(self, in_doubt: bool) -> bool:
         """Whether to measure now, if the caller is `in_doubt` or not.
@@ -146,6 +145,7 @@ class LiveEvidence:
             self._move(*self._last, motions)
         self._last = stamp, scan
         self._since += 1
+        self._monitor.see(stamp * 1e-9, scan)
 
     def _move(self, before: int, scan: Scan, motions: Motions) -> None:
         """Take note of the motion that ended at the scan before."""
@@ -163,6 +163,7 @@ class LiveEvidence:
             # What a member did before says nothing of it now, but the drive has the jump.
             self._forget_errors()
             self._restarted = before
+        self._monitor.move(before * 1e-9, motions.T_previous_current, restarted)
         # The first scan is where the odometry starts, whatever motion it was given.
         if self._newest is None:
             T[:] = np.eye(4)
@@ -183,6 +184,11 @@ class LiveEvidence:
             # Before the start of the longest hop, one more is kept, to confirm it.
             while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
+
+    def check(self) -> None:
+        """Compare the motion since the last check with a registration of the scans at its ends."""
+        if self._newest is not None:
+            self._monitor.measure(self._newest.stamp * 1e-9, self._newest.cloud)
 
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
@@ -243,7 +249,7 @@ class LiveEvidence:
         """The odometry's motion, and those of members that disagree with it."""
         tried: list[Poses] = []
         for T in invert(start.T_odom_sensor) @ end.T_odom_sensor:
-            if all(_distance(T, other) > NEW_GUESS for other in tried) and len(tried) < _GUESSES:
+            if all(apart(T, other) > NEW_GUESS for other in tried) and len(tried) < _GUESSES:
                 tried.append(T)
         return tried
 
@@ -333,7 +339,9 @@ class LiveEvidence:
 
     def estimated(self, selection: Selection) -> Selection:
         """A selection with what is measured."""
-        selection = selection._replace(lost=self.lost, restart=self._told_to_restart())
+        state, why = self.health
+        restart = self._told_to_restart()
+        selection = selection._replace(state=state, why=why, restart=restart)
         # Where registrations are rejected, the last chains are of before.
         if self._rejected >= HOPS_TO_BE_LOST:
             return selection
@@ -351,12 +359,6 @@ def spread_of(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.zeros(vectors.shape[:-2])
     deviations = vectors - vectors.mean(axis=-2, keepdims=True)
     return np.asarray(np.sqrt((deviations**2).sum(axis=-1).mean(axis=-1)))
-
-
-def _distance(T: Poses, other: Poses) -> float:
-    """How far two motions are apart, in metres; a radian counts as much as ten metres."""
-    moved = invert(other) @ T
-    return float(np.linalg.norm(moved[:3, 3]) + _FULL_TURN * rotation_angle(moved))
 
 
 # Hops along a recording whose poses are known, at least in part.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, rectify, squared_ranges
+from adaptune.geometry import Poses, invert, rectify, rotation_angle, squared_ranges
 from adaptune.recording.compensation import compensate
 from adaptune.recording.scan import Scan
 
@@ -21,6 +21,8 @@ MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
+_FULL_TURN = 10.0
+"""Metres at which a difference in rotation counts as one in translation, in radians."""
 _MIN_RANGE = 1.0
 _MIN_POINTS = 100  # points; small_gicp crashes on an empty target, and three points always converge
 REACHES, OFFLINE_REACHES = (1.0,), (2.0, 0.5)
@@ -40,6 +42,7 @@ class Hop(NamedTuple):
     T_start_end: Poses
     # Of shape (3, 3): keeps of a vector in the start's frame what the registration can tell.
     projection: NDArray[np.float64]
+    inliers: float = 1.0  # share of points near a point of the other scan
 
 
 class Hops(NamedTuple):
@@ -147,8 +150,15 @@ def register(
             T_start_end = result.T_target_source  # noqa: PLW2901
         T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
-            return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)
+            projection = T[:3, :3] @ _known_directions(result) @ T[:3, :3].T
+            return Hop(T, projection, result.num_inliers / source.size())
     return None
+
+
+def apart(T: Poses, other: Poses) -> float:
+    """How far two motions are apart, in metres; a radian counts as much as ten metres."""
+    moved = invert(other) @ T
+    return float(np.linalg.norm(moved[:3, 3]) + _FULL_TURN * rotation_angle(moved))
 
 
 def _known_directions(result: Any) -> NDArray[np.float64]:

@@ -1,0 +1,179 @@
+"""Whether to believe an odometry's pose: one state, from all that is known while it drives.
+
+The motion over each second is compared with a direct registration of the scans at its ends, which
+also sees an odometry that stands still; the size of scans, restarts and missing poses, and what
+hops say (`adaptune.live.evidence`), count beside it.
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from adaptune.geometry import Poses, invert, rotation_angle, scale
+from adaptune.live.hops import NEW_GUESS, Hop, HopCloud, apart, register
+from adaptune.recording.scan import Scan
+from adaptune.space import State
+
+HELD = 3.0
+"""Seconds for which what was found counts; twice the interval of slower scans."""
+OFF, OFF_SHARE = 0.25, 0.05
+"""Metres, and share of the way, by which a motion over a second may differ from a registration:
+several times what registrations are wrong by, and half of a jump that matters."""
+OFF_ANGLE = 0.07
+"""Radians by which it may differ."""
+FEWER, NEARER = 0.7, 0.5
+"""Shares of the usual number of points, and of their median range, below which a scan is odd: the
+sensor is covered, or data are lost."""
+USUAL_SCANS, ODD_SECONDS = 15, 10.0
+"""Scans whose median is usual; what stays odd for longer is usual, too."""
+USUALLY = 0.8
+"""Share of registrations that were accepted from which one that is not means something."""
+STARTS, STARTS_SECONDS = 3, 10.0
+"""Restarts within so many seconds by which an odometry is lost."""
+LONGEST = 2.0
+"""Seconds between scans that are compared, or twice their interval."""
+HOPS_TO_BE_LOST = 2
+"""Hops in a row that must disagree before it counts as lost, or be rejected to be in doubt."""
+NO_POSE = 1.0
+"""Seconds without a pose after which it is lost."""
+
+
+class Health(NamedTuple):
+    """Whether to believe a pose, and why not."""
+
+    state: State = "unknown"
+    why: str = ""
+
+
+class _Step(NamedTuple):
+    """What a registration over a second said."""
+
+    seconds: float
+    accepted: bool
+    off: str = ""  # how it contradicts the odometry; empty if it does not
+    known: bool = False  # whether it tells the motion's direction
+
+
+class HealthMonitor:
+    """Knows whether to believe an odometry, or a bank, by its scans and motions."""
+
+    def __init__(self) -> None:
+        self._sizes: deque[tuple[int, float]] = deque(maxlen=USUAL_SCANS)
+        self._odd: tuple[float, str] | None = None  # since when, and what
+        self._odd_until = -np.inf
+        self._steps: deque[_Step] = deque(maxlen=30)
+        self._starts: deque[float] = deque(maxlen=STARTS)
+        self._begin: tuple[float, HopCloud] | None = None
+        self.begun = False  # whether the next call of `measure` ends what this one began
+        self._T_begin_now = np.eye(4)
+        self._measured: tuple[Poses, float] | None = None  # the last second's motion
+        self._now = self._posed = self._period = 0.0
+        self._first = np.inf
+
+    def see(self, seconds: float, scan: Scan) -> None:
+        """See the newest scan."""
+        self._period = max(0.0, seconds - self._now) if np.isfinite(self._first) else 0.0
+        if not np.isfinite(self._first):
+            self._first = self._posed = seconds
+        self._now = seconds
+        points = scan.points[::10]
+        reach = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+        usual = np.median(self._sizes, axis=0) if len(self._sizes) == USUAL_SCANS else (0, 0.0)
+        odd = ""
+        if len(scan) < FEWER * usual[0]:
+            odd = f"a scan has {len(scan):,} points, {usual[0]:,.0f} were usual"
+        elif reach < NEARER * usual[1]:
+            odd = f"half of the points are within {reach:.1f} m, {usual[1]:.1f} m was usual"
+        if odd:
+            since = seconds if self._odd is None else self._odd[0]
+            self._odd, self._odd_until = (since, odd), seconds
+        elif seconds - self._odd_until > HELD:
+            self._odd = None
+        if not odd or seconds - (self._odd[0] if self._odd else seconds) > ODD_SECONDS:
+            self._sizes.append((len(scan), reach))
+
+    def move(self, seconds: float, T_previous_current: Poses, restarted: bool) -> None:
+        """Learn the motion to the scan of a time, NaN without a pose, and a restart there."""
+        if np.isfinite(T_previous_current).all():
+            self._posed = seconds
+            self._T_begin_now = self._T_begin_now @ T_previous_current
+        if restarted:
+            self._starts.append(seconds)
+
+    def measure(self, seconds: float, cloud: HopCloud) -> None:
+        """Compare the motion since the last call with a registration of the scans at its ends."""
+        begin, T = self._begin, self._T_begin_now
+        self._begin, self._T_begin_now = (seconds, cloud), np.eye(4)
+        took = 0.0 if begin is None else seconds - begin[0]
+        # Over a longer time, scans have too little in common.
+        self.begun = not 0.0 < took <= max(LONGEST, 2.0 * self._period)
+        if begin is None or self.begun:
+            return
+        guesses = [T]
+        if self._measured is not None:
+            goes_on = scale(self._measured[0], took / self._measured[1])
+            if apart(T, goes_on) > NEW_GUESS:
+                guesses.append(goes_on)
+        found = [hop for guess in guesses if (hop := register(begin[1], cloud, [guess]))]
+        if not found:
+            self._measured = None
+            self._steps.append(_Step(seconds, False))
+            return
+        best = max(found, key=lambda hop: hop.inliers)
+        self._measured = best.T_start_end, took
+        self._steps.append(_Step(seconds, True, _contradicts(T, best, took), _is_known(T, best)))
+
+    def health(self, wrong: int = 0, rejected: int = 0) -> Health:
+        """The state now; so many hops in a row were `wrong` by much, or `rejected`."""
+        now, held = self._now, max(HELD, 2.0 * self._period)
+        starts = [at for at in self._starts if now - at <= STARTS_SECONDS]
+        decided = [step for step in self._steps if step.accepted]
+        # Where nothing is in doubt, seconds are compared seldom.
+        until = self._begin[0] if self._begin else now
+        last = [step for step in self._steps if until - step.seconds <= held]
+        off = [step.off for step in decided[-2:] if until - step.seconds <= 2.0 * held]
+        if now - self._posed > max(NO_POSE, 2.0 * self._period):
+            return Health("lost", f"no pose for {now - self._posed:.1f} s")
+        if len(starts) >= STARTS:
+            return Health("lost", f"{len(starts)} impossible motions within {STARTS_SECONDS:g} s")
+        if len(off) == 2 and all(off):
+            return Health("lost", off[-1])
+        if wrong >= HOPS_TO_BE_LOST:
+            return Health("lost", "registrations over 10 m contradict its motion")
+        if starts and now - starts[-1] <= held:
+            return Health("doubtful", "its motion was impossible")
+        if any(step.off for step in last):
+            return Health("doubtful", next(step.off for step in reversed(last) if step.off))
+        if self._odd is not None:
+            return Health("doubtful", self._odd[1])
+        if wrong or rejected >= HOPS_TO_BE_LOST:
+            return Health("doubtful", "registrations over 10 m do not confirm its motion")
+        usually = np.mean([step.accepted for step in self._steps] or [0.0]) >= USUALLY
+        if len(self._steps) > 5 and usually and not self._steps[-1].accepted:
+            return Health("doubtful", "scans of a second cannot be registered any more")
+        if not any(step.known for step in last):
+            return Health("unknown", "the scans do not tell its motion" if self._steps else "")
+        return Health("good")
+
+
+def _contradicts(T_odom: Poses, hop: Hop, took: float) -> str:
+    """How a registration contradicts a motion, in words; empty if it does not."""
+    wrong = hop.projection @ (T_odom[:3, 3] - hop.T_start_end[:3, 3])
+    off, way = float(np.linalg.norm(wrong)), float(np.linalg.norm(hop.T_start_end[:3, 3]))
+    if off > OFF + OFF_SHARE * way:
+        moved = float(np.linalg.norm(T_odom[:3, 3]))
+        return f"it moved {moved:.1f} m in {took:.1f} s, its scans say {way:.1f} m"
+    turned = float(rotation_angle(invert(T_odom) @ hop.T_start_end))
+    if turned > OFF_ANGLE:
+        return f"its turn is off by {np.degrees(turned):.0f} degrees in {took:.1f} s"
+    return ""
+
+
+def _is_known(T_odom: Poses, hop: Hop) -> bool:
+    """Whether a registration tells how far the sensor moved: in a corridor it may not."""
+    step = T_odom[:3, 3]
+    way = float(np.linalg.norm(step))
+    if way < OFF:
+        return float(np.trace(hop.projection)) > 2.5
+    return float(np.linalg.norm(hop.projection @ step)) > 0.7 * way

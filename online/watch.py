@@ -1,0 +1,159 @@
+"""Watch an odometry of somebody else's: how wrong it is, and whether to believe its pose."""
+
+import csv
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adaptune.geometry import Poses, invert
+from adaptune.live.evidence import LiveEvidence
+from adaptune.odometry.base import Motions
+from adaptune.odometry.health import Guard, HealthCheck
+from adaptune.recording.scan import Scan
+from adaptune.recording.timing import Timing
+from adaptune.ros.link import RosLink
+from adaptune.selector import Periods
+from adaptune.space import State
+from adaptune.study.config import SteerConfig
+from online.live import LiveScans, RosMessages
+from online.steered import SteeredNode
+
+DIAGNOSTICS = "/diagnostics"
+LEVELS: dict[State, int] = {"good": 0, "unknown": 1, "doubtful": 1, "lost": 2}
+"""As diagnostic_msgs/DiagnosticStatus counts them: OK, WARN, ERROR."""
+
+
+class Told(NamedTuple):
+    """What is known of an odometry at a scan."""
+
+    stamp: int  # nanoseconds
+    seconds: float  # since the first scan
+    state: State
+    why: str  # what speaks against it
+    error: float  # percent of the way over the last metres; NaN if nothing was measured
+    low: float  # ends of the 95 % interval
+    high: float
+    restarts: int  # how often its motion was none of a platform's, or it gave no pose
+
+
+class Watch:
+    """Watches an odometry by its poses and the scans, and steers nothing.
+
+    Show it every scan with its pose. Once a second, `see` tells what is known; it takes some tens
+    of milliseconds then. An error is that over `length` metres. `health` bounds the platform's
+    motion.
+    """
+
+    def __init__(self, length: float = 10.0, health: HealthCheck | None = None):
+        self._evidence, self._guard = LiveEvidence((), length), Guard(health or HealthCheck())
+        self._periods, self._starts = Periods(1e9), 0
+        self._T = np.eye(4)  # the motion to the scan before
+        self._last: tuple[int, Poses] | None = None
+        self._first = 0
+
+    def see(self, scan: Scan, T_odom_sensor: Poses) -> Told | None:
+        """See a scan and its pose, of shape (4, 4), NaN if there is none; tell once a second."""
+        self._evidence.observe(scan.stamp, scan, Motions(self._T, {}, self._starts))
+        known = bool(np.isfinite(T_odom_sensor).all())
+        if self._last is None:
+            self._first, self._T = scan.stamp, np.eye(4)
+        elif not known:
+            self._T = np.full((4, 4), np.nan)
+        else:
+            # Over the scans without a pose, too.
+            before, T_before = self._last
+            elapsed, self._T = (scan.stamp - before) * 1e-9, invert(T_before) @ T_odom_sensor
+            if self._guard.check(self._T, elapsed) is not None:
+                self._starts += 1
+                T_healthy, T_step = self._guard.go_on(elapsed)
+                self._T = T_healthy @ T_step
+        if known or self._last is None:
+            self._last = scan.stamp, np.array(T_odom_sensor)
+        if not self._periods.due(scan.stamp):
+            return None
+        self._evidence.check()
+        if self._evidence.due(self._evidence.health.state in ("doubtful", "lost")):
+            self._evidence.measure()
+        (state, why), error = self._evidence.health, self._evidence.own_error()
+        numbers = (math.nan,) * 3 if error is None else tuple(error)
+        seconds = (scan.stamp - self._first) * 1e-9
+        return Told(scan.stamp, seconds, state, why, *numbers, self._starts)
+
+
+def watch_topics(
+    link: RosLink,
+    points: str,
+    settings: SteerConfig,
+    length: float,
+    tell: Callable[[Told], None],
+    frame: str = "odom",
+) -> None:
+    """Watch a node on a robot until Ctrl-C; where the clock goes back, all begins anew.
+
+    What is told is published as diagnostics, too.
+    """
+    scans = LiveScans(link, points, Timing(), 1)
+    publish = link.advertise(DIAGNOSTICS, "diagnostic_msgs/msg/DiagnosticArray")
+    messages = RosMessages(link.store, frame)
+    try:
+        while not scans.stopped:
+            watch = Watch(length)
+            with closing(SteeredNode(link, settings, points)) as node:
+                for i, (scan, _, _) in enumerate(scans.arrivals()):
+                    if not i:
+                        node.start(scan, np.eye(4))
+                        T_odom_sensor = np.eye(4)
+                    else:
+                        node.submit(scan)
+                        T_odom_sensor = node.collect().T_odom_sensor
+                    if (told := watch.see(scan, T_odom_sensor)) is not None:
+                        tell(told)
+                        publish(messages.diagnostics(told.stamp, settings.odometry, *_shown(told)))
+    except KeyboardInterrupt:
+        scans.stop()
+
+
+def _shown(told: Told) -> tuple[int, str, dict[str, str]]:
+    values = {"state": told.state, "restarts": str(told.restarts)}
+    for name in ("error", "low", "high"):
+        if math.isfinite(value := getattr(told, name)):
+            values[f"{name} [% of the way]"] = f"{value:.3f}"
+    return LEVELS[told.state], told.why or told.state, values
+
+
+def write_told(path: Path, told: Iterator[Told] | list[Told]) -> None:
+    """Write what was told as CSV."""
+    from adaptune.files import replacing
+
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        rows = ((f"{x:.3f}" if isinstance(x, float) else x for x in one) for one in told)
+        csv.writer(file).writerows([Told._fields, *rows])
+
+
+def in_words(told: list[Told]) -> list[str]:
+    """Whether to believe the odometry, in at most four sentences."""
+    if len(told) < 2:
+        return ["Too short to tell: give two seconds of scans at least."]
+    spans = [(one, after.seconds - one.seconds) for one, after in pairwise(told)]
+    total = told[-1].seconds - told[0].seconds
+    known: dict[Any, float] = {}
+    for one, seconds in spans:
+        known[one.state] = known.get(one.state, 0.0) + seconds
+    said = []
+    for state, first in (("lost", "Do not rely on it"), ("doubtful", "Look at it")):
+        if seconds := known.get(state, 0.0):
+            begin = next(one for one, _ in spans if one.state == state)
+            what = f"{first}: it is {state} for {seconds:.0f} s of {total:.0f}"
+            said.append(f"{what}, first at {begin.seconds:.1f} s: {begin.why}.")
+    if not said:
+        unknown = known.get("unknown", 0.0)
+        said = [f"Nothing speaks against it in {total:.0f} s, {unknown:.0f} of them unknown."]
+    errors = [one.error for one in told if math.isfinite(one.error)]
+    if errors:
+        said.append(f"Its error is {np.mean(errors):.2f} % of the way in the mean, as measured.")
+    return said

@@ -1,0 +1,75 @@
+import csv
+
+import numpy as np
+import pytest
+from rooms import moved, scan_at, street, trajectory
+from typer.testing import CliRunner
+
+import drives
+from adaptune.commands.cli import app
+from adaptune.recording.scan import Scan
+from adaptune.trajectory import write_tum
+from online.watch import Watch, in_words
+
+STEP = 0.3
+
+
+def watched(wrong=lambda T, i: T, n=70):  # noqa: ARG005
+    watch, told = Watch(length=5.0), []
+    for i in range(n):
+        scan = scan_at(street(), STEP * i, seed=i)
+        told.append(watch.see(Scan(i * 10**8, scan.points), wrong(moved(STEP * i), i)))
+    return [one for one in told if one is not None]
+
+
+def test_nothing_speaks_against_what_is_right():
+    told = watched()
+    assert [one.state for one in told[2:]] == ["good"] * 5
+    assert told[-1].high < 2.0
+    assert in_words(told)[0].startswith("Nothing speaks against it in 6 s")
+
+
+def test_what_stands_still_is_not_to_be_relied_on():
+    told = watched(lambda T, i: moved(STEP * min(i, 30)))
+    assert told[-1].state == "lost"
+    first, *_ = in_words(told)
+    assert first.startswith("Do not rely on it: it is lost for")
+    assert "first at" in first
+
+
+def test_a_lost_cloud_is_no_failure():
+    told = watched(lambda T, i: T if i % 10 != 5 else np.full((4, 4), np.nan))
+    assert [one.state for one in told[2:]] == ["good"] * 5
+    assert told[-1].restarts == 0
+
+
+@pytest.fixture
+def bag(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scans = drives.scans(n_scans=40)
+    drives.write_bag(tmp_path / "a.bag", scans)
+    T = np.array([scan.T_world_sensor for scan in scans])
+    write_tum(tmp_path / "odom.tum", trajectory(T))
+    return tmp_path / "a.bag"
+
+
+def test_the_command_watches_along_a_bag(bag):
+    result = CliRunner().invoke(app, ["watch", str(bag), "--odometry", "/truth"])
+    assert result.exit_code == 0, result.output
+    rows = list(csv.DictReader((bag.parent / "watch.csv").open()))
+    assert rows[-1]["state"] == "good"
+    assert float(rows[-1]["seconds"]) > 2.0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--odometry", "/odom"], "name a bag, or listen on a robot"),
+        (["a.bag", "--odometry", "/odom", "--ros2"], "name a bag, or listen on a robot"),
+        (["a.bag", "--odometry", "/nobody"], "/nobody"),
+        (["--ros2", "--odometry", "/odom"], "--points: name the topic"),
+    ],
+)
+def test_what_is_wrong_is_told(bag, words, says):  # noqa: ARG001
+    result = CliRunner().invoke(app, ["watch", *words])
+    assert says in str(result.exception) + result.output
