@@ -43,7 +43,8 @@ GUIDE = [page for page in (ROOT / "docs").glob("*.md") if page.stem != "README"]
 CODE = re.compile(r"^```.*?^```|^    .*?$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 ELSEWHERE = re.compile(
-    r"--ros|--cluster|import-rustle|configs/|adaptune tune|tuned.yaml|_ros2|bags/|--against"
+    r"--ros|--cluster|import-rustle|configs/|adaptune (tune|evaluate|watch)|tuned.yaml|_ros2|bags/"
+    r"|--against"
 )
 """Lines of commands that other tests run: with ROS, a cluster, RUSTLE's files, the demo."""
 QUICKER = {"online.real_time.rate=1": "online.real_time.rate=50"}

@@ -51,7 +51,8 @@ def settings(tmp_path):
 
     def make(habits=None, before=(), **given):
         command = (*before, *node, json.dumps(habits or {}), "{parameters}")
-        given = {"patience": 20.0, "image": None, "command": command} | given
+        patient = {"patience": 20.0, "ready": 300.0}
+        given = patient | {"image": None, "command": command} | given
         return ros2(tmp_path / "icp.yaml", **given)
 
     return make
