@@ -329,7 +329,7 @@ class Selector(_Measuring):
         is_worse = error is not None and error.low > MAX_TIMES_PREDICTED * predicted
         # A fixed set is not left because a place is new alone.
         is_new = not self._stands_by and self._is_new()
-        if is_new or is_worse or self._failed or self._live.health.state == "lost":
+        if is_new or is_worse or self._failed or self._live.health.state in {"doubtful", "lost"}:
             self._all_work_until = seconds + REMEMBERED
         # Somebody has to go on.
         present = self._live.present()[np.isin(self.members, self._always)]

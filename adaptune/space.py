@@ -535,3 +535,8 @@ class Selection(NamedTuple):
     def lost(self) -> bool:
         """Whether the odometry, or the bank, has lost track."""
         return self.state == "lost"
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether something speaks against the pose."""
+        return self.state in {"doubtful", "lost"}

@@ -84,20 +84,20 @@ def told(scans: Sequence[Scan], T_odom_sensor: Poses) -> list[Told]:
 Fault = Callable[[Sequence[Scan], Poses, int, np.random.Generator], tuple[Sequence[Scan], Poses]]
 
 
-def _jump(scans, T, at, rng):  # noqa: ANN001, ANN202 - as `Fault`
+def _jump(scans, T, at, rng):
     angle, T = rng.uniform(0.0, 2.0 * np.pi), T.copy()
     T[at:, :2, 3] += 0.5 * np.array([np.cos(angle), np.sin(angle)])
     return scans, T
 
 
-def _freeze(scans, T, at, rng):  # noqa: ANN001, ANN202, ARG001
+def _freeze(scans, T, at, rng):  # noqa: ARG001
     T = T.copy()
     T[at:] = T[at - 1]
     return scans, T
 
 
 def _altered(alter: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Fault:
-    def fault(scans, T, at, rng):  # noqa: ANN001, ANN202, ARG001
+    def fault(scans, T, at, rng):  # noqa: ARG001
         given = list(scans)
         for i in range(at, len(scans)):
             kept = alter(scans[i].points, rng).astype(np.float32)
@@ -114,7 +114,7 @@ def _half(points: np.ndarray, _: np.random.Generator) -> np.ndarray:
 def _covered(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A hand before the sensor: a sixth of the view is left."""
     seen = np.abs(np.arctan2(points[:, 1], points[:, 0])) < np.pi / 6.0
-    hand = rng.normal(0.0, 0.05, (500, 3)) + [0.3, 0.0, 0.0]
+    hand = rng.normal([0.3, 0.0, 0.0], 0.05, (500, 3))
     return np.concatenate([points[seen], hand])
 
 

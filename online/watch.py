@@ -80,9 +80,9 @@ class Watch:
         if self._evidence.due(self._evidence.health.state in ("doubtful", "lost")):
             self._evidence.measure()
         (state, why), error = self._evidence.health, self._evidence.own_error()
-        numbers = (math.nan,) * 3 if error is None else tuple(error)
+        mean, low, high = (math.nan,) * 3 if error is None else error
         seconds = (scan.stamp - self._first) * 1e-9
-        return Told(scan.stamp, seconds, state, why, *numbers, self._starts)
+        return Told(scan.stamp, seconds, state, why, mean, low, high, self._starts)
 
 
 def watch_topics(

@@ -351,7 +351,7 @@ class Bank(OdometryInstance):
                 f"with these trials"
             )
         self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
-        self._lost = selection.lost
+        self._lost = selection.in_doubt
         self._asked = np.isin(self.trials, list(selection.restart))
         self._resting = np.isin(self.trials, list(selection.resting))
         self._waking = (self._waking | self.late.resting) & ~self._resting

@@ -6,6 +6,7 @@ hops say (`adaptune.live.evidence`), count beside it.
 """
 
 from collections import deque
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +28,8 @@ FEWER, NEARER = 0.7, 0.5
 sensor is covered, or data are lost."""
 USUAL_SCANS, ODD_SECONDS = 15, 10.0
 """Scans whose median is usual; what stays odd for longer is usual, too."""
-USUALLY = 0.8
-"""Share of registrations that were accepted from which one that is not means something."""
+USUALLY, LEAST_STEPS = 0.8, 5
+"""Share of so many registrations that were accepted from which one that is not means something."""
 STARTS, STARTS_SECONDS = 3, 10.0
 """Restarts within so many seconds by which an odometry is lost."""
 LONGEST = 2.0
@@ -126,35 +127,43 @@ class HealthMonitor:
 
     def health(self, wrong: int = 0, rejected: int = 0) -> Health:
         """The state now; so many hops in a row were `wrong` by much, or `rejected`."""
-        now, held = self._now, max(HELD, 2.0 * self._period)
-        starts = [at for at in self._starts if now - at <= STARTS_SECONDS]
-        decided = [step for step in self._steps if step.accepted]
+        held = max(HELD, 2.0 * self._period)
         # Where nothing is in doubt, seconds are compared seldom.
-        until = self._begin[0] if self._begin else now
-        last = [step for step in self._steps if until - step.seconds <= held]
-        off = [step.off for step in decided[-2:] if until - step.seconds <= 2.0 * held]
-        if now - self._posed > max(NO_POSE, 2.0 * self._period):
-            return Health("lost", f"no pose for {now - self._posed:.1f} s")
-        if len(starts) >= STARTS:
-            return Health("lost", f"{len(starts)} impossible motions within {STARTS_SECONDS:g} s")
-        if len(off) == 2 and all(off):
-            return Health("lost", off[-1])
-        if wrong >= HOPS_TO_BE_LOST:
-            return Health("lost", "registrations over 10 m contradict its motion")
-        if starts and now - starts[-1] <= held:
-            return Health("doubtful", "its motion was impossible")
-        if any(step.off for step in last):
-            return Health("doubtful", next(step.off for step in reversed(last) if step.off))
-        if self._odd is not None:
-            return Health("doubtful", self._odd[1])
-        if wrong or rejected >= HOPS_TO_BE_LOST:
-            return Health("doubtful", "registrations over 10 m do not confirm its motion")
-        usually = np.mean([step.accepted for step in self._steps] or [0.0]) >= USUALLY
-        if len(self._steps) > 5 and usually and not self._steps[-1].accepted:
-            return Health("doubtful", "scans of a second cannot be registered any more")
+        until = self._begin[0] if self._begin else self._now
+        steps = [step for step in self._steps if until - step.seconds <= 2.0 * held]
+        last = [step for step in steps if until - step.seconds <= held]
+        if why := next(self._losses(steps, wrong), ""):
+            return Health("lost", why)
+        if why := next(self._doubts(last, held, wrong, rejected), ""):
+            return Health("doubtful", why)
         if not any(step.known for step in last):
             return Health("unknown", "the scans do not tell its motion" if self._steps else "")
         return Health("good")
+
+    def _losses(self, steps: Sequence[_Step], wrong: int) -> Iterator[str]:
+        if (seconds := self._now - self._posed) > max(NO_POSE, 2.0 * self._period):
+            yield f"no pose for {seconds:.1f} s"
+        if sum(self._now - at <= STARTS_SECONDS for at in self._starts) >= STARTS:
+            yield f"{STARTS} impossible motions or more within {STARTS_SECONDS:g} s"
+        off = [step.off for step in steps if step.accepted][-2:]
+        if len(off) == 2 and all(off):
+            yield off[-1]
+        if wrong >= HOPS_TO_BE_LOST:
+            yield "registrations over 10 m contradict its motion"
+
+    def _doubts(
+        self, last: Sequence[_Step], held: float, wrong: int, rejected: int
+    ) -> Iterator[str]:
+        if self._starts and self._now - self._starts[-1] <= held:
+            yield "its motion was impossible"
+        yield from (step.off for step in reversed(last) if step.off)
+        if self._odd is not None:
+            yield self._odd[1]
+        if wrong or rejected >= HOPS_TO_BE_LOST:
+            yield "registrations over 10 m do not confirm its motion"
+        accepted = [step.accepted for step in self._steps]
+        if len(accepted) > LEAST_STEPS and np.mean(accepted) >= USUALLY and not accepted[-1]:
+            yield "scans of a second cannot be registered any more"
 
 
 def _contradicts(T_odom: Poses, hop: Hop, took: float) -> str:

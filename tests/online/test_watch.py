@@ -1,20 +1,19 @@
 import csv
 
+import drives
 import numpy as np
 import pytest
-from rooms import moved, scan_at, street, trajectory
+from rooms import moved, scan_at, street
 from typer.testing import CliRunner
 
-import drives
 from adaptune.commands.cli import app
 from adaptune.recording.scan import Scan
-from adaptune.trajectory import write_tum
 from online.watch import Watch, in_words
 
 STEP = 0.3
 
 
-def watched(wrong=lambda T, i: T, n=70):  # noqa: ARG005
+def watched(wrong=lambda T, _: T, n=70):
     watch, told = Watch(length=5.0), []
     for i in range(n):
         scan = scan_at(street(), STEP * i, seed=i)
@@ -30,7 +29,7 @@ def test_nothing_speaks_against_what_is_right():
 
 
 def test_what_stands_still_is_not_to_be_relied_on():
-    told = watched(lambda T, i: moved(STEP * min(i, 30)))
+    told = watched(lambda _, i: moved(STEP * min(i, 30)))
     assert told[-1].state == "lost"
     first, *_ = in_words(told)
     assert first.startswith("Do not rely on it: it is lost for")
@@ -46,10 +45,7 @@ def test_a_lost_cloud_is_no_failure():
 @pytest.fixture
 def bag(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    scans = drives.scans(n_scans=40)
-    drives.write_bag(tmp_path / "a.bag", scans)
-    T = np.array([scan.T_world_sensor for scan in scans])
-    write_tum(tmp_path / "odom.tum", trajectory(T))
+    drives.write_bag(tmp_path / "a.bag", drives.scans(n_scans=40))
     return tmp_path / "a.bag"
 
 

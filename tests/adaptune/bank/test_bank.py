@@ -104,7 +104,9 @@ def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
     x = {}
     for lost in (False, True):
         bank = Bank(make, sets, 1.0)
-        bank.apply(Selection(0, {}, dict.fromkeys(range(3), 1 / 3), lost=lost))
+        bank.apply(
+            Selection(0, {}, dict.fromkeys(range(3), 1 / 3), state="lost" if lost else "good")
+        )
         bank.start(bank.prepare(turns.turn(0)), np.eye(4))
         x[lost] = bank.register(bank.prepare(turns.turn(1))).T_odom_sensor[0, 3]
     assert x[True] == pytest.approx(turns.STEP)

@@ -89,7 +89,7 @@ def test_the_weights_leave_a_member_that_drifts():
     assert third < 0.02
     assert first > 0.6
     assert live.own_error().mean < 0.3
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
 
 
 def test_the_first_scan_is_compensated_by_the_motion_after_it():
@@ -106,40 +106,40 @@ def test_nothing_is_measured_before_the_first_hop(exactly):  # noqa: ARG001
     assert drive(live, 6, bank(1.0)) == []
     assert live.squares() is None
     assert live.own_error() is None
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
     selection = live.estimated(Selection(3, {}))
     assert np.isnan(selection.estimated_error)
 
 
-def test_it_is_lost_after_two_rejections_in_a_row_and_sound_again(exactly):
+def test_it_is_in_doubt_after_two_rejections_in_a_row_and_sound_again(exactly):
     live = LiveEvidence((0, 1))
     drive(live, 50, bank(1.0, 1.0))
     exactly(lambda *_: None)
     states = []
     for i in range(50, 80, 10):
         drive(live, 10, bank(1.0, 1.0), first=i)
-        states.append(live.lost)
-    assert states == [False, True, True]
+        states.append(live.health.state)
+    assert states == ["unknown", "doubtful", "doubtful"]
     selection = live.estimated(Selection(0, {}))
-    assert selection.lost
+    assert selection.state == "doubtful"
     assert np.isnan(selection.estimated_error)
     exactly(exact)
     drive(live, 10, bank(1.0, 1.0), first=80)
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
 
 
 def test_it_is_lost_where_two_hops_disagree_with_it(exactly):  # noqa: ARG001
     live = LiveEvidence((0, 1))
     far_off = 1.0 + 1.5 * LOST / 100.0
     drive(live, 20, bank(far_off, 1.0))
-    assert not live.lost  # one hop
+    assert live.health.state == "doubtful"  # one hop
     drive(live, 10, bank(far_off, 1.0), first=20)
-    assert live.lost
+    assert live.health.state == "lost"
     selection = live.estimated(Selection(0, {}))
     assert selection.restart == {0}
     assert selection.estimated_error > LOST / 2
     drive(live, 20, bank(1.0, 1.0), first=30)
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
 
 
 def test_a_lost_member_is_told_to_restart_once(exactly):  # noqa: ARG001
@@ -166,7 +166,7 @@ def test_a_scan_without_a_pose_is_no_loss_of_track(exactly):  # noqa: ARG001
         return Motions(nan, {0: nan}) if i in (35, 45) else bank(1.0)(i)
 
     drive(live, 41, failing, first=30)
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
     assert live.estimated(Selection(0, {})).restart == frozenset()
 
 
@@ -187,9 +187,9 @@ def test_a_robot_that_stands_does_not_drive_by_jitter(exactly):  # noqa: ARG001
 def test_after_a_reset_it_is_as_new(exactly):  # noqa: ARG001
     live = LiveEvidence((0, 1))
     drive(live, 60, bank(1.5, 1.0))
-    assert live.lost
+    assert live.health.state == "lost"
     live.reset()
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
     assert live.squares() is None
     assert live.estimated(Selection(0, {})).restart == frozenset()
     drive(live, 60, bank(1.0, 1.0))
@@ -222,7 +222,7 @@ def test_after_a_restart_the_own_error_has_the_jump_and_the_members_are_as_new(e
     drive(live, 10, restarting, first=jump + 1)
     assert live.squares() is None  # over the restart
     assert live.due(in_doubt=False)
-    assert not live.lost
+    assert live.health.state == "doubtful"
     drive(live, 10, restarting, first=jump + 11)
     assert live.squares().products[1, 1] == pytest.approx(4.0, rel=0.01)
     # One of six sub-trajectories lost half a metre of ten.
@@ -318,10 +318,10 @@ def test_a_registration_that_another_does_not_confirm_counts_as_rejected(exactly
         taken, states = [], []
         for i in range(0, 110, 10):
             taken += [one.end.stamp for one in drive(live, 10, bank(1.01, 0.0), first=i)]
-            states.append(live.lost)
+            states.append(live.health.state)
         assert len(taken) == found
         assert not {end * 10**8 for _, end in pairs} & set(taken)
-        assert any(states) == lost
+        assert ("doubtful" in states) == lost
         assert not states[-1]
         assert live.own_error().mean < 1.1
         assert measured_weights(2, live.squares())[0] > 0.75
@@ -349,7 +349,7 @@ def test_a_slip_counts_at_any_speed(exactly, speed):
         seen.append(live.own_error() and live.own_error().mean)
     assert seen[28] == pytest.approx(0.0, abs=1e-6)
     assert max(seen[30:]) > 0.02 * 100.0 * slip / 25.0
-    assert not live.lost
+    assert live.health.state == "unknown"  # no second was compared
 
 
 def test_what_a_hop_cannot_tell_counts_for_nothing(exactly):
