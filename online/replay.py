@@ -169,10 +169,9 @@ class Driver:
         lost = choice.selection.lost
         if lost != (self._applied is not None and self._applied.lost):
             who = "odometry" if choice.selection.weights is None else "bank"
-            does = f"is lost ({choice.selection.why})" if lost else "goes on"
-            _log.warning(
-                "%s: the %s %s at %.1f s", self._what, who, does, self._seconds(choice.stamp)
-            )
+            does = f"{'is lost' if lost else 'goes on'} at {self._seconds(choice.stamp):.1f} s"
+            why = f": {choice.selection.why}" if lost and choice.selection.why else ""
+            _log.warning("%s: the %s %s%s", self._what, who, does, why)
 
 
 @dataclass(eq=False, repr=False)

@@ -243,8 +243,8 @@ def test_commands_work(pages):
 
 
 def test_the_loop_on_a_robot_is_what_adaptune_online_does(folder):
-    (text,) = (code for _, code in blocks("python") if "TimedSelector(mode" in code)
-    last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
+    (text,) = (code for _, code in blocks("python") if "Driver(odometry" in code)
+    last = "    T_odom_sensor = driver.register(scan).T_odom_sensor\n"
     assert last in text
     model = None
     for mechanism in ("bank", "live"):

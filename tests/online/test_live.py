@@ -227,8 +227,10 @@ def test_a_pose_with_its_stamp():
 
 def test_all_messages_are_those_of_ros_2_too():
     store = get_typestore(Stores.ROS2_JAZZY)
-    messages, selection = RosMessages(store, "odom"), Selection(3, {"voxel": 0.5}, lost=True)
+    messages = RosMessages(store, "odom")
+    selection = Selection(3, {"voxel": 0.5}, state="lost", why="no pose for 2.0 s")
     for made in (
+        messages.diagnostics(5, "/odom", 2, "no pose for 2.0 s", {"state": "lost"}),
         messages.odometry(5, *placed(np.eye(4)[None]), "lidar", (0.1, 0.2)),
         messages.transform(5, *placed(np.eye(4)[None]), "lidar"),
         messages.selection(5, selection, ""),

@@ -58,7 +58,7 @@ def selections():
             estimated_error=estimated[0],
             estimated_low=estimated[1],
             estimated_high=estimated[2],
-            lost=i == 2,
+            state="lost" if i == 2 else "good",
         )
         yield Choice(int(STAMPS[10 * i]), chosen, 0.004 * (i + 1))
 

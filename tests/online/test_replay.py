@@ -169,7 +169,7 @@ class Losing(Chooser):
 
     def select(self):
         selection = super().select()
-        return selection._replace(lost=self.lost[len(self.asked) - 1])
+        return selection._replace(state="lost" if self.lost[len(self.asked) - 1] else "good")
 
 
 def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, caplog):

@@ -45,7 +45,7 @@ class Measuring(UntrainedSelector):
                 estimated_error=error,
                 estimated_low=error - 1.0,
                 estimated_high=error + 3.0,
-                lost=self.n == 2,
+                state="lost" if self.n == 2 else "good",
             )
         )
 

@@ -11,5 +11,5 @@ def test_a_drive_is_told_in_a_few_words():
     record.newest = Choice(0, SET._replace(estimated_error=0.5), 0.01)
     assert now(record) == "trial 7, error 0.50 %"
     record.dropped = 3
-    record.newest = Choice(1, SET._replace(lost=True), 0.01)
+    record.newest = Choice(1, SET._replace(state="lost"), 0.01)
     assert now(record) == "3 dropped, trial 7, lost: do not rely on the pose"

@@ -322,7 +322,7 @@ def test_a_registration_that_another_does_not_confirm_counts_as_rejected(exactly
         assert len(taken) == found
         assert not {end * 10**8 for _, end in pairs} & set(taken)
         assert ("doubtful" in states) == lost
-        assert not states[-1]
+        assert states[-1] == "unknown"
         assert live.own_error().mean < 1.1
         assert measured_weights(2, live.squares())[0] > 0.75
 
