@@ -92,7 +92,7 @@ def error_chart(replayed: ReplayedSequence) -> Chart | None:
     if any(np.isfinite(track.errors).any() for track in replayed.modes.values()):
         panels.append(_errors(replayed))
     for mode, track in replayed.modes.items():
-        if np.isfinite(track.estimated[:, 0]).any() or track.lost.any():
+        if np.isfinite(track.estimated[:, 0]).any() or _in_doubt(track).any():
             panels.append(_estimates(mode, track, replayed))
     if not panels:
         return None
@@ -126,11 +126,11 @@ def _errors(replayed: ReplayedSequence) -> Panel:
 def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Panel:
     seconds, (estimated, low, high) = track.choice_seconds, track.estimated.T
     drawn: list[Drawn] = []
-    if track.lost.any():
+    if (doubted := _in_doubt(track)).any():
         # From a selection at which that changes to the next; what is not shaded has no name.
-        begins = np.flatnonzero(np.diff(track.lost, prepend=~track.lost[0]))
-        names = tuple("lost" if lost else "" for lost in track.lost[begins])
-        drawn.append(Spans([*seconds[begins], track.seconds[-1]], names, "lost"))
+        begins = np.flatnonzero(np.append(True, track.states[1:] != track.states[:-1]))
+        names = tuple(str(track.states[i]) if doubted[i] else "" for i in begins)
+        drawn.append(Spans([*seconds[begins], track.seconds[-1]], names, "state"))
     if np.isfinite(track.errors_behind).any():
         judge = "by the estimated reference" if replayed.estimated else "true"
         drawn.append(Line(track.seconds, track.errors_behind, judge))
@@ -140,6 +140,10 @@ def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Pane
     ]
     y = Axis(f"RTE over {replayed.length:g} m,\nlast 30 s [%]", log=True)
     return Panel(TIME, y, tuple(drawn), f"{mode}: its error as measured while driving")
+
+
+def _in_doubt(track: ModeReplay) -> NDArray[np.bool_]:
+    return np.isin(track.states, ("doubtful", "lost"))
 
 
 def choice_chart(replayed: ReplayedSequence) -> Chart | None:

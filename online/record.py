@@ -110,6 +110,7 @@ class StoredReplay:
     # Other columns of ``selections.csv``, of shape (m,): NaN where they are unknown, and of a mode
     # that keeps its parameters.
     selections: Mapping[str, NDArray[np.float64]]
+    states: NDArray[np.str_]  # of shape (m,), see `Selection`
 
     @property
     def restarted(self) -> NDArray[np.bool_]:
@@ -146,6 +147,8 @@ class StoredReplay:
             stamps = np.array(list(map(int, columns.pop("stamp_ns"))), np.int64)
             weights = _weights(columns.pop("weights"))
             selections = {name: _floats(columns.pop(name)) for name in _NUMBERS}
+            # Older versions did not write it.
+            states = np.array(columns.pop("state", ["unknown"] * len(stamps)), np.str_)
             # Another version of adaptune may have written further columns.
             if (about := summary.inputs.get("odometry")) is not None:
                 names = load_space(about["parameters"]).names
@@ -159,8 +162,9 @@ class StoredReplay:
             kept = summary.inputs["parameters"] or {}
             columns = {name: [str(value)] for name, value in kept.items()}
             stamps, selections = trajectory.stamps[:1], dict.fromkeys(_NUMBERS, np.full(1, np.nan))
+            states = np.array(["unknown"])
         choices = {name: _numbers(values) for name, values in columns.items()}
-        return cls(summary, trajectory, frames, stamps, choices, weights, selections)
+        return cls(summary, trajectory, frames, stamps, choices, weights, selections, states)
 
 
 def switched(choices: Mapping[str, Sequence[Any]]) -> NDArray[np.bool_]:
@@ -255,8 +259,8 @@ def _lost_seconds(replay: ReplayRecord) -> float:
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
 _PREDICTED = ("predicted_error_percent", "predicted_fixed_percent", "familiarity")
 _NUMBERS = ("trial", *_PREDICTED, *_ESTIMATED, "lost", "ms")
-_TEXTS = ("why_not", "fallen_back", "state")
-SELECTION_COLUMNS = ("stamp_ns", *_NUMBERS[:-1], "weights", "ms", *_TEXTS)
+_TEXTS = ("why_not", "fallen_back")
+SELECTION_COLUMNS = ("stamp_ns", *_NUMBERS[:-1], "weights", "ms", *_TEXTS, "state")
 """Columns of ``selections.csv`` before the parameters."""
 FRAME_COLUMNS = ("stamp_ns", "registered", "restarted", "prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv``."""

@@ -60,7 +60,7 @@ class ModeReplay(NamedTuple):
     # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
     # interval; NaN where there is none.
     estimated: NDArray[np.float64]
-    lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
+    states: NDArray[np.str_]  # of shape (m,), see `Selection`
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
 
     @property
@@ -145,7 +145,7 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
         replay.choices,
         {_member(replay, model, number): weights for number, weights in replay.weights.items()},
         replay.estimated,
-        replay.lost,
+        replay.states,
         places,
     )
 

@@ -91,31 +91,30 @@ def watch_topics(
     settings: SteerConfig,
     length: float,
     tell: Callable[[Told], None],
-    frame: str = "odom",
+    queue: int = 1,
 ) -> None:
     """Watch a node on a robot until Ctrl-C; where the clock goes back, all begins anew.
 
-    What is told is published as diagnostics, too.
+    What is told is published as diagnostics, too. Of scans that come meanwhile, so many wait.
     """
-    scans = LiveScans(link, points, Timing(), 1)
     publish = link.advertise(DIAGNOSTICS, "diagnostic_msgs/msg/DiagnosticArray")
-    messages = RosMessages(link.store, frame)
-    try:
-        while not scans.stopped:
-            watch = Watch(length)
-            with closing(SteeredNode(link, settings, points)) as node:
+    messages = RosMessages(link.store, "odom")
+    with closing(SteeredNode(link, settings, points)) as node:
+        scans = LiveScans(link, points, Timing(), queue)
+        try:
+            while not scans.stopped:
+                watch = Watch(length)
                 for i, (scan, _, _) in enumerate(scans.arrivals()):
-                    if not i:
-                        node.start(scan, np.eye(4))
-                        T_odom_sensor = np.eye(4)
+                    if i:
+                        T_odom_sensor = node.register(scan).T_odom_sensor
                     else:
-                        node.submit(scan)
-                        T_odom_sensor = node.collect().T_odom_sensor
+                        T_odom_sensor = np.eye(4)
+                        node.start(scan, T_odom_sensor)
                     if (told := watch.see(scan, T_odom_sensor)) is not None:
                         tell(told)
                         publish(messages.diagnostics(told.stamp, settings.odometry, *_shown(told)))
-    except KeyboardInterrupt:
-        scans.stop()
+        except KeyboardInterrupt:
+            scans.stop()
 
 
 def _shown(told: Told) -> tuple[int, str, dict[str, str]]:

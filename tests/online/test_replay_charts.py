@@ -30,20 +30,22 @@ def test_restarts_are_marked():
 
 def test_what_a_mode_measured_of_itself_has_a_panel():
     estimated = np.array([[np.nan] * 3, [0.7, 0.4, 1.2], [0.8, 0.5, 1.3]])
-    lost = np.array([True, False, True])
+    states = np.array(["lost", "good", "doubtful"])
     behind = np.where(SECONDS > 5.0, 0.7, np.nan)
-    made = bank(estimated=estimated, lost=lost, errors_behind=behind)
+    made = bank(estimated=estimated, states=states, errors_behind=behind)
     _, own = error_chart(sequence(fixed=kept(), adaptive=made)).panels
     assert "adaptive" in own.title
     (spans,) = of_kind(own, Spans)
     assert list(spans.edges) == [0.0, 8.0, 9.0, SECONDS[-1]]
-    assert spans.names == ("lost", "", "lost")
+    assert spans.names == ("lost", "", "doubtful")
     (band,) = of_kind(own, Band)
     np.testing.assert_array_equal(band.high, estimated[:, 2])
     assert [line.name for line in of_kind(own, Line)] == ["true", "measured while driving"]
     # Without a reference, that is all there is.
     blind = {"errors": np.full(len(SECONDS), np.nan)}
-    (alone,) = error_chart(sequence(adaptive=bank(estimated=estimated, lost=lost, **blind))).panels
+    (alone,) = error_chart(
+        sequence(adaptive=bank(estimated=estimated, states=states, **blind))
+    ).panels
     assert alone.title == own.title
     assert error_chart(sequence(fixed=replay(**blind))) is None
 

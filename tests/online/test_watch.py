@@ -1,6 +1,7 @@
 import csv
 
 import drives
+import local_link
 import numpy as np
 import pytest
 from rooms import moved, scan_at, street
@@ -8,7 +9,8 @@ from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
 from adaptune.recording.scan import Scan
-from online.watch import Watch, in_words
+from adaptune.study.config import SteerConfig
+from online.watch import Watch, in_words, watch_topics
 
 STEP = 0.3
 
@@ -69,3 +71,27 @@ def test_the_command_watches_along_a_bag(bag):
 def test_what_is_wrong_is_told(bag, words, says):  # noqa: ARG001
     result = CliRunner().invoke(app, ["watch", *words])
     assert says in str(result.exception) + result.output
+
+
+def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics():
+    played, told = drives.scans(4, 30), []
+
+    def messages():
+        for i, (stamp, points, T) in enumerate(played):
+            still = played[min(i, 18)][2]  # it stands still in the end
+            yield "/odom", local_link.odometry(stamp, still if i > 18 else T)
+            yield "/points", local_link.cloud(stamp, points)
+
+    def tell(one):
+        told.append(one)
+        if len(told) == 3:
+            raise KeyboardInterrupt
+
+    link = local_link.LocalLink(messages())
+    settings = SteerConfig(node="/odom", odometry="/odom", patience=60.0)
+    watch_topics(link, "/points", settings, 5.0, tell, queue=0)
+    assert [one.state for one in told[:2]] == ["unknown", "unknown"]
+    first = link.published["/diagnostics"][0].status[0]
+    assert (first.level, first.name) == (1, "adaptune: /odom")
+    assert {pair.key for pair in first.values} >= {"state", "restarts"}
+    assert not link.holds  # it sets no parameter

@@ -23,7 +23,7 @@ def replay(**changed):
         choices={"distance": [0.7, 0.9, 0.9], "kernel": ["none", "none", "huber"]},
         weights={},
         estimated=np.full((3, 3), np.nan),
-        lost=np.zeros(3, bool),
+        states=np.full(3, "good"),
         places=XY,
     )
     return made._replace(**changed)
@@ -32,7 +32,7 @@ def replay(**changed):
 def kept():
     """A replay that keeps its parameters."""
     fixed = {"distance": [0.7], "kernel": ["none"]}
-    one = {"choice_seconds": np.zeros(1), "choices": fixed, "lost": np.zeros(1, bool)}
+    one = {"choice_seconds": np.zeros(1), "choices": fixed, "states": np.full(1, "good")}
     return replay(**one, estimated=np.full((1, 3), np.nan))
 
 
