@@ -110,8 +110,10 @@ class _Measuring:
         see `LiveEvidence.due`. Nothing depends on when it is called after `select`, and without it
         only the training counts.
         """
-        self._live.check()
-        if self._live.due(self._in_doubt()):
+        due = self._live.due(self._in_doubt())
+        if due or self._live.checking:
+            self._live.check()
+        if due:
             self._live.measure()
 
     def _in_doubt(self) -> bool:

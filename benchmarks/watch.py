@@ -1,6 +1,6 @@
 """How soon a watched odometry is in doubt where something is wrong, and how often where not.
 
-    python benchmarks/watch.py [FOLDER] [--seconds 60] [--planted 100] [--drifts 60]
+    python benchmarks/watch.py [FOLDER] [--metres 100] [--planted 100] [--drifts 60]
 
 GICP with its own parameters drives along simulated courses, and along the recordings of a folder.
 Faults are planted into its poses, or into the scans that it gets; drifts into its motions. The
@@ -57,11 +57,11 @@ def odometry(scans: Sequence[Scan]) -> Poses:
     return np.array([np.eye(4), *(gicp.register(gicp.prepare(s)).T_odom_sensor for s in scans[1:])])
 
 
-def drives(folder: Path | None, seconds: float, seeds: Sequence[int]) -> Iterator[Driven]:
+def drives(folder: Path | None, metres: float, seeds: Sequence[int]) -> Iterator[Driven]:
     """All drives, one after the other."""
     for seed in seeds:
         for scene in SCENES:
-            course = Course(scenes=(scene,), length=seconds, seed=seed)
+            course = Course(scenes=(scene,), length=metres, seed=seed)
             scans = list(simulate(course))
             T = np.array([scan.T_world_sensor for scan in scans])
             yield Driven(f"{scene} {seed}", scans, odometry(scans), T)
@@ -141,7 +141,7 @@ def planted(drive: Driven, kind: str, rng: np.random.Generator) -> tuple[float, 
     if not len(starts):
         return None
     at = int(rng.choice(starts))
-    first = int(np.searchsorted(seconds, seconds[at] - BEFORE))
+    first = int(np.searchsorted(seconds, seconds[at] - BEFORE + rng.uniform()))
     last = int(np.searchsorted(seconds, seconds[at] + AFTER))
     scans, T = drive.scans[first:last], drive.T_odom_sensor[first:last]
     found = told(*FAULTS[kind](scans, T, at - first, rng))
@@ -206,13 +206,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--seconds", type=float, default=100.0, help="metres of a course")
+    parser.add_argument("--metres", type=float, default=100.0, help="of a course")
     parser.add_argument("--seeds", type=int, nargs="+", default=[211, 212])
     parser.add_argument("--planted", type=int, default=100)
     parser.add_argument("--drifts", type=int, default=60)
     given = parser.parse_args()
     rng, faults, drifts = np.random.default_rng(0), dict[str, list](), dict[str, list[float]]()
-    every = list(drives(given.folder, given.seconds, given.seeds))
+    every = list(drives(given.folder, given.metres, given.seeds))
     print(f"{'drive':14} {'s':>5}  good  unknown doubtful lost  interval holds")
     for drive in every:
         found = told(drive.scans, drive.T_odom_sensor)

@@ -77,7 +77,7 @@ class Watch:
         if not self._periods.due(scan.stamp):
             return None
         self._evidence.check()
-        if self._evidence.due(self._evidence.health.state in ("doubtful", "lost")):
+        if self._evidence.due(False):
             self._evidence.measure()
         (state, why), error = self._evidence.health, self._evidence.own_error()
         mean, low, high = (math.nan,) * 3 if error is None else error

@@ -125,6 +125,7 @@ class LiveEvidence:
         have yet to reach over a sub-trajectory, and after `SELDOM` scans.
         """
         unknown = not len(self._hops.errors) or self._rejected or self._wrong.any()
+        in_doubt = in_doubt or self.health.state in {"doubtful", "lost"}
         if in_doubt or unknown or self._since >= SELDOM:
             return True
         behind = 0.0 if self._newest is None else self._newest.metres - self._measured
@@ -184,6 +185,11 @@ class LiveEvidence:
             # Before the start of the longest hop, one more is kept, to confirm it.
             while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
+
+    @property
+    def checking(self) -> bool:
+        """Whether the last `check` began a second that is to be compared."""
+        return self._monitor.begun
 
     def check(self) -> None:
         """Compare the motion since the last check with a registration of the scans at its ends."""

@@ -129,7 +129,7 @@ class HealthMonitor:
         """The state now; so many hops in a row were `wrong` by much, or `rejected`."""
         held = max(HELD, 2.0 * self._period)
         # Where nothing is in doubt, seconds are compared seldom.
-        until = self._begin[0] if self._begin else self._now
+        until = self._steps[-1].seconds if self._steps else self._now
         steps = [step for step in self._steps if until - step.seconds <= 2.0 * held]
         last = [step for step in steps if until - step.seconds <= held]
         if why := next(self._losses(steps, wrong), ""):

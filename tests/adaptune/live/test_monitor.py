@@ -97,3 +97,19 @@ def test_no_pose_and_many_restarts_are_loss():
     assert (restarted[5].state, restarted[7].state) == ("lost", "lost")
     once = states(right, starts=lambda i: int(i > 45))
     assert [one.state for one in once[4:]] == ["good", "doubtful", "doubtful", "doubtful"]
+
+
+def test_where_nothing_is_in_doubt_one_second_of_five_is_compared():
+    live, checked, found = LiveEvidence(), [], []
+    for i in range(20 * RATE):
+        live.observe(i * 10**8, scan(i), Motions(moved(STEP), {}))
+        if i % RATE == 0:
+            due = live.due(in_doubt=False)
+            if due or live.checking:
+                live.check()
+                checked.append(i // RATE)
+            if due:
+                live.measure()
+            found.append(live.health.state)
+    assert len(checked) < 16
+    assert set(found[3:]) == {"good"}
