@@ -3,14 +3,15 @@
     python benchmarks/watch.py [FOLDER] [--metres 100] [--planted 100] [--drifts 60]
 
 GICP with its own parameters drives along simulated courses, and along the recordings of a folder.
-Faults are planted into its poses, or into the scans that it gets; drifts into its motions. The
-first table says how many were in doubt within two seconds or five metres, and after how long; the
-second, after how many metres the interval of the error leaves what was told before; the third, the
-share of the time in each state on the drives as they are, and how often the interval holds the true
-mean error of the last half minute.
+The first table has the share of the time in each state, in doubt in vain (no second of the last
+four was wrong by much), what watching takes of a core, and how often the interval holds the true
+mean error of the last half minute. Then faults are planted into poses, or into the scans that GICP
+gets: how many are in doubt within two seconds or five metres, and after how long. And drifts: after
+how many metres the interval leaves what was told before.
 """
 
 import argparse
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert
+from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.odometry.registry import odometry_class
 from adaptune.recording.inspect import inspect
@@ -31,6 +32,8 @@ from online.watch import Told, Watch
 RECORDINGS = ("town", "street", "road", "city", "hall")
 SCENES = ("street", "mine", "open", "garden")
 LENGTH, BEFORE, AFTER = 10.0, 12.0, 6.0
+WRONG = 0.2, 3.0
+"""Metres, and degrees, of a second from which an odometry is rightly doubted."""
 SOON, NEAR = 2.0, 5.0
 """Seconds, and metres, within which a fault is to be noticed."""
 
@@ -184,6 +187,19 @@ def drifted(drive: Driven, kind: str, rng: np.random.Generator) -> float | None:
     return float(np.interp(left[0], seconds, metres) - metres[at]) if left else np.inf
 
 
+def in_vain(drive: Driven, found: Sequence[Told]) -> float:
+    """Share of the time in doubt where no second of the last four was wrong by much."""
+    seconds, T, T_ref = drive.seconds, drive.T_odom_sensor, drive.T_ref_sensor
+    assert T_ref is not None
+    behind = np.searchsorted(seconds, seconds - 1.0)
+    wrong = invert(invert(T_ref[behind]) @ T_ref) @ (invert(T[behind]) @ T)
+    off = np.linalg.norm(wrong[:, :3, 3], axis=1)
+    bad = (off > WRONG[0]) | (np.degrees(rotation_angle(wrong)) > WRONG[1])
+    at = [(seconds > one.seconds - 4.0) & (seconds <= one.seconds) for one in found]
+    vain = [_in_doubt(one) and not bad[of].any() for one, of in zip(found, at, strict=True)]
+    return float(np.mean(vain))
+
+
 def held(drive: Driven, found: Sequence[Told]) -> list[bool]:
     """Whether each interval holds the mean error of sub-trajectories of the last half minute."""
     if drive.T_ref_sensor is None:
@@ -213,14 +229,18 @@ def main() -> None:
     given = parser.parse_args()
     rng, faults, drifts = np.random.default_rng(0), dict[str, list](), dict[str, list[float]]()
     every = list(drives(given.folder, given.metres, given.seeds))
-    print(f"{'drive':14} {'s':>5}  good  unknown doubtful lost  interval holds")
+    print(f"{'drive':12} {'s':>3}    good unknown doubtful lost  in vain    core  interval holds")
     for drive in every:
+        begun = time.process_time()
         found = told(drive.scans, drive.T_odom_sensor)
+        core = (time.process_time() - begun) / drive.seconds[-1]
         shares = [np.mean([one.state == state for one in found[3:]]) for state in STATES]
         inside = held(drive, found)
         cells = "  ".join(f"{share:6.1%}" for share in shares)
         holds = f"{np.mean(inside):6.1%} of {len(inside)}" if inside else "-"
-        print(f"{drive.name:14} {drive.seconds[-1]:5.0f}  {cells}  {holds}", flush=True)
+        vain = f"{in_vain(drive, found[3:]):6.1%}" if drive.T_ref_sensor is not None else "     -"
+        cells += f"  {vain}  {core:6.1%}"
+        print(f"{drive.name:12} {drive.seconds[-1]:3.0f}  {cells}  {holds}", flush=True)
     for i in range(given.planted):
         kind, drive = list(FAULTS)[i % len(FAULTS)], every[i // len(FAULTS) % len(every)]
         if (found := planted(drive, kind, rng)) is not None:

@@ -23,6 +23,8 @@ from adaptune.study.config import SteerConfig
 from online.live import LiveScans, RosMessages
 from online.steered import SteeredNode
 
+WINDOW = 15.0
+"""Seconds over which the error is told, or 30 m: a drift is to be seen soon."""
 DIAGNOSTICS = "/diagnostics"
 LEVELS: dict[State, int] = {"good": 0, "unknown": 1, "doubtful": 1, "lost": 2}
 """As diagnostic_msgs/DiagnosticStatus counts them: OK, WARN, ERROR."""
@@ -50,7 +52,8 @@ class Watch:
     """
 
     def __init__(self, length: float = 10.0, health: HealthCheck | None = None):
-        self._evidence, self._guard = LiveEvidence((), length), Guard(health or HealthCheck())
+        self._evidence = LiveEvidence((), length, WINDOW)
+        self._guard = Guard(health or HealthCheck())
         self._periods, self._starts = Periods(1e9), 0
         self._T = np.eye(4)  # the motion to the scan before
         self._last: tuple[int, Poses] | None = None
@@ -77,8 +80,7 @@ class Watch:
         if not self._periods.due(scan.stamp):
             return None
         self._evidence.check()
-        if self._evidence.due(False):
-            self._evidence.measure()
+        self._evidence.measure()
         (state, why), error = self._evidence.health, self._evidence.own_error()
         mean, low, high = (math.nan,) * 3 if error is None else error
         seconds = (scan.stamp - self._first) * 1e-9

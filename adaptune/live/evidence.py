@@ -79,9 +79,11 @@ class LiveEvidence:
     error `own_error` estimates, in metres.
     """
 
-    def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):
+    def __init__(
+        self, members: tuple[int, ...] = (), length: float = 25.0, seconds: float = OWN_SECONDS
+    ):
         self.members = members
-        self._length = length
+        self._length, self._seconds = length, seconds
         self.reset()
 
     def reset(self) -> None:
@@ -104,7 +106,7 @@ class LiveEvidence:
 
     def _begin(self) -> None:
         self._forget_errors()
-        self._own = OwnErrors(self._length)
+        self._own = OwnErrors(self._length, seconds=self._seconds)
         self._anchors: deque[_Anchor] = deque()
         self._measured = -np.inf
 

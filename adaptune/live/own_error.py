@@ -71,8 +71,8 @@ class _Chain(NamedTuple):
 class OwnErrors:
     """Chains of the last hops, or of a whole recording, for the mean error over `length` metres."""
 
-    def __init__(self, length: float, whole: bool = False):
-        self._length, self._whole = length, whole
+    def __init__(self, length: float, whole: bool = False, seconds: float = OWN_SECONDS):
+        self._length, self._whole, self._seconds = length, whole, seconds
         self._links: deque[Link] = deque()
         self._chains: deque[_Chain] = deque()
 
@@ -84,7 +84,7 @@ class OwnErrors:
         self._chains.append(_chain(self._links, self._length))
         if self._whole:
             return
-        until, behind = link.seconds - OWN_SECONDS, link.end - max(METRES, self._length)
+        until, behind = link.seconds - self._seconds, link.end - max(METRES, self._length)
         while self._chains[0].seconds < until and self._chains[0].start < behind:
             self._chains.popleft()
 
