@@ -20,6 +20,7 @@ from adaptune.reference.judge import Reference
 from adaptune.trajectory import Trajectory
 
 _PAUSE = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
+_RARE = 1.6  # times the judge's step, from which on a trajectory gives few poses, as keyframes
 
 
 class Judge(NamedTuple):
@@ -138,7 +139,7 @@ class Judged:
 
     @cached_property
     def faults(self) -> list[Finding]:
-        """Where it jumps, stands still while the robot moves, or gives nothing."""
+        """Where it jumps, stands still while the robot moves, or gives nothing, or little."""
         judge, stamps = self.judge, self.trajectory.stamps
         found = [f._replace(mend="") for f in sound(self.trajectory, judge.begin, name="it")[1]]
         if found and found[-1].seconds is None:
@@ -148,13 +149,18 @@ class Judged:
                 raise AdaptuneError(f"{self.title}: {what}")
         still = stands(self.truth, self.odometry.T_world_sensor)
         edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
-        what = "it stands still while the robot moves"
-        spans = [(what, *self.seconds[edge - (0, 1)]) for edge in edges]
         ends = (np.array([min(judge.begin, stamps[0]), *stamps, judge.end]) - judge.begin) * 1e-9
-        usual = max(1.0, _PAUSE * float(np.median(np.diff(ends))))
-        long = np.flatnonzero(np.diff(ends) > usual)
-        spans += [("it gives nothing", *ends[i : i + 2]) for i in long]
-        return found + [Finding((), what, seconds=(float(a), float(b))) for what, a, b in spans]
+        step, of_judge = (float(np.median(np.diff(t))) for t in (ends, judge.trajectory.stamps))
+        long = np.flatnonzero(np.diff(ends) > max(1.0, _PAUSE * step))
+        for what, spans in (
+            ("it stands still while the robot moves", self.seconds[edges.clip(max=len(still) - 1)]),
+            ("it gives nothing", np.column_stack([ends[long], ends[long + 1]])),
+        ):
+            found += [Finding((), what, seconds=(a, b)) for a, b in spans.tolist()]
+        if (times := 1e9 * step / of_judge) > _RARE:
+            what = f"it gives one pose in {times:.2g} of the judge's, and is judged there alone"
+            found.append(Finding((), what))
+        return found
 
     @property
     def row(self) -> dict[str, Any]:

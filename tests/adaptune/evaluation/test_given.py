@@ -1,9 +1,11 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import rec
 
 from adaptune.errors import AdaptuneError
-from adaptune.evaluation.given import Convention, name_of, parted, read
+from adaptune.evaluation.given import Convention, by_name, parted, read
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
 from adaptune.trajectory import Trajectory, write_tum
@@ -71,7 +73,7 @@ def scans(bag):
 
 
 def positions(given, scans):
-    return read(given, scans, Convention(), 10**8).T_world_sensor[:, :3, 3]
+    return read(str(given), given, scans, Convention(), 10**8).T_world_sensor[:, :3, 3]
 
 
 @pytest.mark.parametrize("topic", ["/odom", "/pose", "/path", "BAG:/odom", "BAG:/path"])
@@ -122,17 +124,39 @@ def test_conventions_are_applied(scans):
     place = np.eye(4)
     place[1, 3] = 2.0
     by = Convention(place, 0.5, "end")
-    found = read("/odom", scans, by, 10**8)
+    found = read("/odom", "/odom", scans, by, 10**8)
     np.testing.assert_allclose(found.T_world_sensor[:, 1, 3], 2.0)
     assert found.stamps[0] == rec.START + 6 * 10**8
+    with pytest.raises(AdaptuneError, match=r"no times, .*; give --clock-offset instead of --pose"):
+        read("/odom", "/odom", scans, by, 0)
+
+
+def test_the_option_that_mends_another_clock_is_named_with_all_that_is_to_be_added(scans):
+    by = Convention(clock_offset=1000.0)
+    stamps, T = rec.START + np.arange(N) * 10**8, np.tile(np.eye(4), (N, 1, 1))
+    T[:, 0, 3] = 0.1 * np.arange(N)
+    with pytest.raises(
+        AdaptuneError, match=r"my\.tum covers .*: set `--clock-offset` to the seconds"
+    ):
+        read("my.tum", Trajectory(stamps, T), scans, by, 10**8)
 
 
 def test_bags_are_told_from_trajectories(tmp_path):
     (tmp_path / "drives").mkdir()
     folder, file = str(tmp_path / "drives"), str(tmp_path / "a.tum")
-    words = ["rec", "b.mcap", folder, "/odom", "run2.bag:/odom", file]
+    words = ["a.bag", "b.mcap", folder, "/odom", "run2.bag:/odom", file]
     bags, others = parted(words)
     assert [str(bag) for bag in bags] == words[:3]
     assert others == words[3:]
-    assert name_of("/odom") == "/odom"
-    assert name_of((1, 2), 3) == "trajectory 3"
+    assert parted([file, "a.bag"]) == ([Path("a.bag")], [file])
+    assert parted(["none", file]) == ([Path("none")], [file])
+
+
+def test_files_are_called_by_their_names_where_these_differ(tmp_path):
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.tum").touch()
+    (tmp_path / "b.tum").touch()
+    one, two = (str(tmp_path / folder / "a.tum") for folder in ("one", "two"))
+    given = [one, two, tmp_path / "b.tum", "/odom", (1, 2)]
+    assert list(by_name(given)) == [one, two, "b.tum", "/odom", "trajectory 5"]
