@@ -17,28 +17,19 @@ Words = Annotated[
         show_default=False,
     ),
 ]
-_PLACE, _LATE = (
-    "The LiDAR's pose in the poses' frame: x y z qx qy qz qw.",
-    "To add to their stamps.",
-)
-_ENDS, _MOST = (
-    "`end`: they are of the ends of scans.",
-    "End with 3 if an error surely exceeds that.",
-)
-_METRES, _OUT = "Metres that errors are measured over.", "Folder of the page and the tables."
-Most = Annotated[str | None, typer.Option("--max", metavar="PERCENT", help=_MOST)]
-Extrinsic = Annotated[str | None, typer.Option(metavar="POSE", help=_PLACE)]
-Offset = Annotated[float, typer.Option(metavar="SECONDS", help=_LATE)]
-Moment = Annotated[Literal["stamp", "end"], typer.Option(help=_ENDS)]
-Length = Annotated[float | None, typer.Option(help=_METRES, show_default="as the path allows")]
-Out = Annotated[Path, typer.Option(help=_OUT, file_okay=False)]
+Place = Annotated[str | None, typer.Option(help="LiDAR in the poses' frame: x y z qx qy qz qw.")]
+Offset = Annotated[float, typer.Option(help="Seconds to add to the poses' stamps.")]
+Moment = Annotated[Literal["stamp", "end"], typer.Option(help="`end`: poses of scans' ends.")]
+Length = Annotated[float | None, typer.Option(help="Metres that errors are measured over.")]
+Most = Annotated[str | None, typer.Option("--max", help="Percent; exit with 3 if surely more.")]
+Out = Annotated[Path, typer.Option(help="Folder of the page and the tables.", file_okay=False)]
 
 
 def evaluate(
     words: Words,
     reference: Given = None,
     points: Points = None,
-    extrinsic: Extrinsic = None,
+    extrinsic: Place = None,
     clock_offset: Offset = 0.0,
     pose_time: Moment = "stamp",
     sub_trajectory: Length = None,

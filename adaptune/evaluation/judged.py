@@ -21,6 +21,7 @@ from adaptune.trajectory import Trajectory
 
 _PAUSE = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
 _RARE = 1.6  # times the judge's step, from which on a trajectory gives few poses, as keyframes
+_MOMENTS = 2000  # at which it is asked whether the judge knows a pose
 
 
 class Judge(NamedTuple):
@@ -132,10 +133,9 @@ class Judged:
     @cached_property
     def unknown_share(self) -> float:
         """Share of its time in which the judge knows no pose."""
-        begin, end = max(int(self.trajectory.stamps[0]), self.judge.begin), int(self.stamps[-1])
-        judge = self.judge.trajectory
-        steps = np.diff([begin, *judge.stamps[(judge.stamps > begin) & (judge.stamps < end)], end])
-        return float(steps[steps > judge.max_gap * 1e9].sum() / max(end - begin, 1))
+        begin = max(self.trajectory.stamps[0], self.judge.begin)
+        at = np.linspace(begin, self.stamps[-1], _MOMENTS).astype(np.int64)
+        return float(np.isnan(self.judge.trajectory.at(at)[:, 0, 0]).mean())
 
     @cached_property
     def faults(self) -> list[Finding]:

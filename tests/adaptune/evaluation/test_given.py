@@ -62,6 +62,8 @@ def bag(tmp_path_factory):
     # The map moves rarely, and the base often; the LiDAR is fixed on the base.
     messages += messages_of("/tf", [transform("odom", "base", i, 0.1 * i) for i in range(N)])
     messages += messages_of("/tf", [transform("map", "odom", i, 1.0) for i in (0, N - 1)])
+    by_turns = [transform(("map", "odom")[i % 2], "other", i, 0.0) for i in range(N)]
+    messages += messages_of("/tf", by_turns)
     messages += messages_of("/tf_static", [rec.fixed_frame("lidar", "base", (0.0, 0.5, 0.0))])
     messages.sort(key=lambda message: message[1])
     return rec.write_bag(tmp_path_factory.mktemp("bags") / "a.bag", messages)
@@ -88,11 +90,13 @@ def test_a_chain_of_transforms_is_followed(bag, scans):
         np.testing.assert_allclose(found[:, 0], 1.0 + 0.1 * np.arange(N), atol=1e-9)
         np.testing.assert_allclose(found[:, 1], 0.5, atol=1e-9)
     np.testing.assert_allclose(positions("/tf:odom.base", scans)[:, 1], 0.0)
-    known = "no chain leads from map to base_link; there is base, lidar, map, odom"
+    known = "no chain leads from map to base_link; there is base, lidar, map, odom, other"
     with pytest.raises(AdaptuneError, match=known):
         positions("/tf:map.base_link", scans)
-    with pytest.raises(AdaptuneError, match="or a chain: base, odom"):
+    with pytest.raises(AdaptuneError, match="or a chain: base, odom, other"):
         positions("/tf", scans)
+    with pytest.raises(AdaptuneError, match="other has two parents, map and odom: two nodes"):
+        positions("/tf:map.other", scans)
 
 
 def test_poses_of_two_nodes_are_refused(scans):
