@@ -1,6 +1,5 @@
 """A trajectory as a reference judges it: how wrong it is, where, and how surely."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -117,8 +116,7 @@ class Judged:
     @property
     def blind(self) -> bool:
         """Whether the judge is about as wrong as what it judges."""
-        low = self.interval[0] if self.interval else math.inf
-        return low == 0.0 or self.rte < ERROR_FACTOR * (self.judge.reference.error or 0.0)
+        return self.rte < ERROR_FACTOR * (self.judge.reference.error or 0.0)
 
     @cached_property
     def drift(self) -> tuple[float, float]:
