@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from adaptune.recording.inspect import Inspection
 
 OUT = Path("runs/evaluate")
+_SILENT = 0.1  # share of a recording that may lack poses where an error is surely below a bound
 _OWN = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 """Poses that systems seldom publish: where a bag has one such topic, it is its reference."""
 
@@ -54,11 +55,15 @@ class Evaluation:
         return [{key.lstrip("_"): v for key, v in one.row.items()} for one in self.judged]
 
     def verdict(self, most: float) -> Literal["above", "below", "unclear"]:
-        """Whether any error is surely above so many percent, or surely none is."""
+        """Whether any error is surely above so many percent, or surely none is.
+
+        What a trajectory does not give is not surely below.
+        """
         ends = [one.interval or (0.0, math.inf) for one in self.judged]
         if any(low > most for low, _ in ends):
             return "above"
-        return "below" if all(high <= most for _, high in ends) else "unclear"
+        whole = all(one.silent_share < _SILENT for one in self.judged)
+        return "below" if whole and all(high <= most for _, high in ends) else "unclear"
 
     def __repr__(self) -> str:
         return f"<Evaluation: {' '.join(self.words)} More: {self.page}>"

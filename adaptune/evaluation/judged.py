@@ -136,6 +136,21 @@ class Judged:
         return float(np.isnan(self.judge.trajectory.at(at)[:, 0, 0]).mean())
 
     @cached_property
+    def silent(self) -> NDArray[np.float64]:
+        """From when to when it gives nothing, in seconds of the recording, of shape (m, 2)."""
+        ends = np.array([self.judge.begin, *self.trajectory.stamps, self.judge.end])
+        steps = np.column_stack([ends[:-1], ends[1:]]) - self.judge.begin
+        usual = max(1e9, _PAUSE * float(np.median(np.diff(ends))))
+        return np.asarray(1e-9 * steps[np.diff(ends) > usual])
+
+    @property
+    def silent_share(self) -> float:
+        """Share of the recording in which it gives nothing."""
+        return float(np.diff(self.silent).sum()) / max(
+            1e-9 * (self.judge.end - self.judge.begin), 1.0
+        )
+
+    @cached_property
     def faults(self) -> list[Finding]:
         """Where it jumps, stands still while the robot moves, or gives nothing, or little."""
         judge, stamps = self.judge, self.trajectory.stamps
@@ -147,15 +162,13 @@ class Judged:
                 raise AdaptuneError(f"{self.title}: {what}")
         still = stands(self.truth, self.odometry.T_world_sensor)
         edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
-        ends = (np.array([min(judge.begin, stamps[0]), *stamps, judge.end]) - judge.begin) * 1e-9
-        step, of_judge = (float(np.median(np.diff(t))) for t in (ends, judge.trajectory.stamps))
-        long = np.flatnonzero(np.diff(ends) > max(1.0, _PAUSE * step))
+        step, of_judge = (np.median(np.diff(t)) for t in (stamps, judge.trajectory.stamps))
         for what, spans in (
             ("it stands still while the robot moves", self.seconds[edges.clip(max=len(still) - 1)]),
-            ("it gives nothing", np.column_stack([ends[long], ends[long + 1]])),
+            ("it gives nothing", self.silent),
         ):
             found += [Finding((), what, seconds=(a, b)) for a, b in spans.tolist()]
-        if (times := 1e9 * step / of_judge) > _RARE:
+        if (times := step / of_judge) > _RARE:
             what = f"it gives one pose in {times:.2g} of the judge's, and is judged there alone"
             found.append(Finding((), what))
         return found

@@ -178,6 +178,8 @@ def test_faults_gaps_and_parts_are_told(bag, truth):
     part = Trajectory(truth.stamps[:25], truth.T_world_sensor[:25])
     found = evaluated(bag, part, reference="/truth", sub_trajectory=1.0)
     assert "it gives nothing, from 2.4 to 3.9 s" in " ".join(found.words)
+    assert found.verdict(5.0) == "unclear"
+    assert evaluated(bag, truth, reference="/truth", sub_trajectory=1.0).verdict(5.0) == "below"
 
 
 def test_where_the_judge_knows_nothing_is_told(bag, truth, tmp_path, monkeypatch):
