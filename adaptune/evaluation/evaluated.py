@@ -19,7 +19,11 @@ from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.config import ESTIMATED
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference.check import measure_reference, proposed_sub_trajectory
-from adaptune.reference.diagnosis import contradiction, diagnose_trajectory
+from adaptune.reference.diagnosis import (
+    diagnose_reference,
+    diagnose_trajectory,
+    measured_motions,
+)
 from adaptune.reference.judge import Reference
 from adaptune.study.references import ensure_references
 from adaptune.study.sequences import StudySequences
@@ -200,7 +204,8 @@ def _against(scans: RecordedSequence, given: Trajectory, asked: _Asked) -> tuple
     measured = measure_reference(scans, given, partial(asked.show, "registering"))
     error = measured.error(length := asked.length_of(given))
     if error is None or measured.is_noisy(length):
-        if (cause := contradiction(scans, given)) is not None:
+        motions = measured_motions(scans, len(measured.stamps))
+        if (cause := diagnose_reference(given, measured.stamps, motions)) is not None:
             return None, f"contradicts the scans ({cause})"
         if error is not None and asked.reference is None:
             return None, f"is wrong by {error.mean:.2g} %"

@@ -586,15 +586,6 @@ def diagnose_trajectory(
     return None
 
 
-def contradiction(scans: Recording, reference: Trajectory) -> Finding | None:
-    """Why a reference contradicts registrations of scans, see `diagnose_reference`."""
-    stamps: list[int] = []
-    passing = (stamps.append(scan.stamp) or scan for scan in scans)  # type: ignore[func-returns-value]
-    hops = measured_motions(passing, scans.n_messages)
-    deque(passing, 0)
-    return diagnose_reference(reference, np.array(stamps, np.int64), hops)
-
-
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
     """Whether a reference differs more than an odometry, by the 95 % interval of the mean."""
     # What a registration itself is wrong by, both share.

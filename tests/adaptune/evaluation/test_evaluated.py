@@ -115,6 +115,16 @@ def test_a_given_judge_is_measured_and_its_error_counts(
     assert (wide > 0.1) is (not doubt)
 
 
+def test_a_judge_that_contradicts_the_scans_says_so_where_it_is_named(bag, truth, tmp_path):
+    turned = np.eye(4)
+    turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    write_tum(tmp_path / "turned.tum", Trajectory(truth.stamps, truth.T_world_sensor @ turned))
+    found = evaluated(bag, truth, reference=tmp_path / "turned.tum", sub_trajectory=1.0)
+    assert "turned.tum contradicts the scans (over some metres they differ by " in found.words[0]
+    assert "other axes" in found.words[0]
+    assert found.judged[0].cause is None
+
+
 def test_what_is_judged_is_not_its_own_judge(bag, monkeypatch):
     estimates.install(monkeypatch)
     (one,) = evaluated(bag, "/truth").judged
