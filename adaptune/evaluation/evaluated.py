@@ -186,10 +186,14 @@ def _judge(name: str, found: "Inspection", scans: RecordedSequence, asked: _Aske
     if given is None or (doubt and asked.reference is None):
         found.given["reference"] = ESTIMATED
         sequences = StudySequences({name: found.config()}, {}, asked.out)
-        ensure_references(sequences, [name], asked.length or 5.0, asked.show)
-        given, stored = read_trajectory(sequences.estimate_path(name)), sequences.estimate(name)
-        called = "an estimated reference" + f", as {called} {doubt}" * bool(doubt)
-        doubt = ""
+        length, must = asked.length or 5.0, given is None
+        if why := ensure_references(sequences, [name], length, asked.show, must).get(name):
+            doubt += f", and none can be estimated: {why}"
+        else:
+            given, stored = read_trajectory(sequences.estimate_path(name)), sequences.estimate(name)
+            called = "an estimated reference" + f", as {called} {doubt}" * bool(doubt)
+            doubt = ""
+    assert given is not None  # else there is an error
     reference = Reference.known(given, asked.length_of(given), stored)
     reference = reference if stored else reference._replace(error=error)
     begin, end = scans.source.span() or given.stamps[[0, -1]].tolist()
@@ -208,7 +212,7 @@ def _against(scans: RecordedSequence, given: Trajectory, asked: _Asked) -> tuple
         if (cause := diagnose_reference(given, measured.stamps, motions)) is not None:
             return None, f"contradicts the scans ({cause})"
         if error is not None and asked.reference is None:
-            return None, f"is wrong by {error.mean:.2g} %"
+            return error.low, f"is wrong by {error.mean:.2g} %"
     return None if error is None or measured.doubt else error.low, ""
 
 

@@ -12,6 +12,7 @@ from adaptune.live.own_error import OwnError
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.reference import check
+from adaptune.reference.estimated import EstimateError
 from adaptune.trajectory import Trajectory, write_tum
 
 
@@ -98,7 +99,7 @@ def test_without_a_reference_one_is_estimated_once_and_its_error_counts(
     ],
 )
 def test_a_given_judge_is_measured_and_its_error_counts(
-    bag, truth, monkeypatch, low, doubt, words, judge
+    bag, truth, tmp_path, monkeypatch, low, doubt, words, judge
 ):
     estimates.install(monkeypatch)
     hops = check.Hops.of([])
@@ -113,6 +114,10 @@ def test_a_given_judge_is_measured_and_its_error_counts(
     (exact,) = evaluated(bag, made, sub_trajectory=1.0, reference="/truth").judged
     wide = exact.interval[1] - exact.interval[0]
     assert (wide > 0.1) is (not doubt)
+    estimates.install(monkeypatch).refusal = EstimateError("the scene may be too bare")
+    (one,) = evaluated(bag, made, sub_trajectory=1.0, out=tmp_path).judged
+    assert one.judge.name == "/truth"
+    assert ("none can be estimated: sequences.one: " in one.judge.doubt) is (low > 0.5)
 
 
 def test_a_judge_that_contradicts_the_scans_says_so_where_it_is_named(bag, truth, tmp_path):
