@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.geometry import Poses
 from adaptune.metrics import LOST_ABOVE, span, travelled
-from adaptune.paired import ERROR_FACTOR, Interval, Pair, interval_of_mean
+from adaptune.paired import ERROR_FACTOR, Interval, Pair, in_cell, interval_of_mean
 from adaptune.recording.poses import sound
 from adaptune.reference.carried import stands
 from adaptune.reference.check import FEWEST, LONGER
@@ -146,9 +146,7 @@ class Judged:
     @property
     def silent_share(self) -> float:
         """Share of the recording in which it gives nothing."""
-        return float(np.diff(self.silent).sum()) / max(
-            1e-9 * (self.judge.end - self.judge.begin), 1.0
-        )
+        return float(1e9 * np.diff(self.silent).sum() / max(self.judge.end - self.judge.begin, 1))
 
     @cached_property
     def faults(self) -> list[Finding]:
@@ -182,7 +180,7 @@ class Judged:
             "recording": self.judge.recording,
             "trajectory": self.name,
             "RTE [%]": self.rte,
-            "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
+            "95 %": in_cell(self.interval),
             "drift [m/100 m]": drift,
             "worst [%]": float(self.around[worst]),
             "at [s]": float(self.seconds[worst]),

@@ -95,9 +95,8 @@ def tables(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[Listing]
         for one in judged
     ]
     rows = [
-        {"trajectory": p.better, "against": p.other, "ratio": p.ratio.value}
-        | {"95 %": in_cell(p.ratio.interval)}
-        for p in pairs
+        {"trajectory": best, "against": other, "ratio": of.value, "95 %": in_cell(of.interval)}
+        for best, other, of in pairs
     ]
     return [
         Listing(title, [one.row for one in judged], _CAPTION),
