@@ -191,7 +191,7 @@ def _judge(name: str, found: "Inspection", scans: RecordedSequence, asked: _Aske
             doubt += f", and none can be estimated: {why}"
         else:
             given, stored = read_trajectory(sequences.estimate_path(name)), sequences.estimate(name)
-            called = "an estimated reference" + f", as {called} {doubt}" * bool(doubt)
+            called = "an estimated reference" + f" (as {called} {doubt})" * bool(doubt)
             doubt = ""
     assert given is not None  # else there is an error
     reference = Reference.known(given, asked.length_of(given), stored)

@@ -167,7 +167,7 @@ class Judged:
         ):
             found += [Finding((), what, seconds=(a, b)) for a, b in spans.tolist()]
         if (times := step / of_judge) > _RARE:
-            what = f"it gives one pose in {times:.2g} of the judge's, and is judged there alone"
+            what = f"it gives one pose for {times:.2g} of the judge's, and is judged there alone"
             found.append(Finding((), what))
         return found
 

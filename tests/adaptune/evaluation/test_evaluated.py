@@ -95,7 +95,7 @@ def test_without_a_reference_one_is_estimated_once_and_its_error_counts(
     [
         (0.4, "", "is in the interval as far as registrations show it, 0.4 %", "/truth"),
         (0.4, "it gives 2 scans a second", "whose own error is not known", "/truth"),
-        (0.6, "", "as /truth is wrong by 0.8 %, whose own error", "an estimated reference, as"),
+        (0.6, "", "(as /truth is wrong by 0.8 %), whose own error", "an estimated reference (as"),
     ],
 )
 def test_a_given_judge_is_measured_and_its_error_counts(
@@ -189,7 +189,7 @@ def test_faults_gaps_and_parts_are_told(bag, truth):
     assert str(fault) == "it gives nothing, from 0.7 to 2.4 s"
     rare = Trajectory(truth.stamps[::5], truth.T_world_sensor[::5])
     (one,) = evaluated(bag, rare, reference="/truth", sub_trajectory=1.0).judged
-    assert "one pose in 5 of the judge's, and is judged there alone" in str(one.faults[0])
+    assert "one pose for 5 of the judge's, and is judged there alone" in str(one.faults[0])
     part = Trajectory(truth.stamps[:25], truth.T_world_sensor[:25])
     found = evaluated(bag, part, reference="/truth", sub_trajectory=1.0)
     assert "it gives nothing, from 2.4 to 3.9 s" in " ".join(found.words)
