@@ -413,10 +413,10 @@ class RecordedSequence:
         raise SequenceError(
             f"{self.name}: {what} covers {times[0]} to {times[1]}, the scans cover "
             f"{times[2]} to {times[3]}: set `{key}` to the seconds to add to its stamps"
-            f"{self._proposal(trajectory, offset)}"
+            f"{self._proposal(trajectory, offset, key)}"
         )
 
-    def _proposal(self, trajectory: Trajectory, offset: float) -> str:
+    def _proposal(self, trajectory: Trajectory, offset: float, key: str) -> str:
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
             turns = compensation.turning_of(islice(self._decode(Counter(), Content()), _MOST_SCANS))
@@ -424,7 +424,7 @@ class RecordedSequence:
             return ""
         if (more := compensation.clock_offset(trajectory, *turns)) is None:
             return ""
-        return f" (the scans show the same motion with {offset + more:.3f})"
+        return f" (the scans show the same motion with {key}: {offset + more:.3f})"
 
 
 @once
