@@ -183,13 +183,16 @@ def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArr
 def read_ahead(scans: Iterable[Scan], n: int) -> Iterator[Scan]:
     """Read so many scans ahead in a thread; an error is raised here."""
     source, pool = iter(scans), ThreadPoolExecutor(1)
+    read = deque(pool.submit(next, source, None) for _ in range(n))
     try:
-        read = deque(pool.submit(next, source, None) for _ in range(n))
         while (scan := read.popleft().result()) is not None:
             read.append(pool.submit(next, source, None))
             yield scan
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        _ = [one.cancel() for one in read]
+        # Where it was opened: SQLite lets no other thread close a bag.
+        pool.submit(getattr(source, "close", lambda: None))
+        pool.shutdown(wait=False)
 
 
 class Frame(NamedTuple):
