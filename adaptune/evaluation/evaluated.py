@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -17,22 +17,15 @@ from adaptune.evaluation.shown import Compared, in_words, write_evaluation
 from adaptune.paired import ratio
 from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.config import ESTIMATED
+from adaptune.recording.fleet import Reading
+from adaptune.recording.inspect import Inspection
 from adaptune.recording.recording import RecordedSequence, wants_estimate
-from adaptune.reference.check import measure_reference, proposed_sub_trajectory
-from adaptune.reference.diagnosis import (
-    diagnose_reference,
-    diagnose_trajectory,
-    measured_motions,
-)
+from adaptune.reference import check, diagnosis
 from adaptune.reference.judge import Reference
 from adaptune.study.references import ensure_references
 from adaptune.study.sequences import StudySequences
 from adaptune.trajectory import Trajectory, read_trajectory
 from adaptune.tuning.asked import Asked, check_guarded, recorded
-
-if TYPE_CHECKING:
-    from adaptune.recording.fleet import Reading
-    from adaptune.recording.inspect import Inspection
 
 OUT = Path("runs/evaluate")
 _SILENT = 0.1  # share of a recording that may lack poses where an error is surely below a bound
@@ -82,7 +75,7 @@ def evaluate(
     clock_offset: float = 0.0,
     pose_time: Literal["stamp", "end"] = "stamp",
     sub_trajectory: float | None = None,
-    reading: "Reading | None" = None,
+    reading: Reading | None = None,
     out: str | Path = OUT,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -144,10 +137,10 @@ class _Asked(NamedTuple):
 
     def length_of(self, judge: Trajectory) -> float:
         """Metres over which errors are measured."""
-        return self.length or proposed_sub_trajectory(judge, training=0.0)
+        return self.length or check.proposed_sub_trajectory(judge, training=0.0)
 
 
-def _of_recording(name: str, found: "Inspection", asked: _Asked) -> list[Judged]:
+def _of_recording(name: str, found: Inspection, asked: _Asked) -> list[Judged]:
     """All trajectories of a recording, judged."""
     if asked.reference is None:
         found.given["reference"] = _own_reference(found, asked.trajectories)
@@ -158,13 +151,13 @@ def _of_recording(name: str, found: "Inspection", asked: _Asked) -> list[Judged]
     judged = []
     for called, trajectory in poses.items():
         stamps = judge.stamps(trajectory)
-        cause = diagnose_trajectory(trajectory, judge.trajectory, stamps, span, place)
+        cause = diagnosis.diagnose_trajectory(trajectory, judge.trajectory, stamps, span, place)
         cause = None if judge.doubt else cause
         judged.append(Judged(called, judge, trajectory, stamps, cause))
     return judged
 
 
-def _own_reference(found: "Inspection", trajectories: Collection[str]) -> str | None:
+def _own_reference(found: Inspection, trajectories: Collection[str]) -> str | None:
     """The recording's own poses, where they are not among what is judged; else an estimate."""
     if found.reference is not None and "reference" not in found.used:
         return None  # those of a folder
@@ -172,7 +165,7 @@ def _own_reference(found: "Inspection", trajectories: Collection[str]) -> str | 
     return own[0] if len(own) == 1 and own[0] not in trajectories else ESTIMATED
 
 
-def _judge(name: str, found: "Inspection", scans: RecordedSequence, asked: _Asked) -> Judge:
+def _judge(name: str, found: Inspection, scans: RecordedSequence, asked: _Asked) -> Judge:
     """What judges: a given reference, or an estimated one.
 
     Where scans show that the recording's own is wrong, and nobody named it, it does not judge.
@@ -205,11 +198,11 @@ def _against(scans: RecordedSequence, given: Trajectory, asked: _Asked) -> tuple
 
     Both are empty where they show nothing.
     """
-    measured = measure_reference(scans, given, partial(asked.show, "registering"))
+    measured = check.measure_reference(scans, given, partial(asked.show, "registering"))
     error = measured.error(length := asked.length_of(given))
     if error is None or measured.is_noisy(length):
-        motions = measured_motions(scans, len(measured.stamps))
-        if (cause := diagnose_reference(given, measured.stamps, motions)) is not None:
+        motions = diagnosis.measured_motions(scans, len(measured.stamps))
+        if (cause := diagnosis.diagnose_reference(given, measured.stamps, motions)) is not None:
             return None, f"contradicts the scans ({cause})"
         if error is not None and asked.reference is None:
             return error.low, f"is wrong by {error.mean:.2g} %"

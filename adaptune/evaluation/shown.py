@@ -98,18 +98,19 @@ def tables(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[Listing]
         {"trajectory": best, "against": other, "ratio": of.value, "95 %": in_cell(of.interval)}
         for best, other, of in pairs
     ]
-    return [
+    found = [
         Listing(title, [one.row for one in judged], _CAPTION),
         Listing("Errors as evo and KITTI's benchmark have them", of_others),
         Listing("The best against each other one", rows),
     ]
+    return found if pairs else found[:2]
 
 
 def write_evaluation(out: Path, judged: Sequence[Judged], pairs: Sequence[Compared]) -> Path:
     """Write the page, its charts, and the table as CSV and JSON; returns the page."""
     notes = [f"{one.title}: {f}." for one in judged for f in (one.cause, *one.faults) if f]
-    made = tuple(t for t in tables(judged, pairs) if t.rows)
-    section = PageSection("Errors", tuple(notes), tuple(_charts(judged)), made)
+    made = tuple(_charts(judged)), tuple(tables(judged, pairs))
+    section = PageSection("Errors", tuple(notes), *made)
     by = f"Judged by {', '.join(dict.fromkeys(one.judge.name for one in judged))}"
     path = out / "evaluation.html"
     write_page(path, Page("Evaluation", by, tuple(in_words(judged, pairs)), (section,)))

@@ -6,7 +6,6 @@ import pytest
 
 import adaptune
 from adaptune.errors import AdaptuneError
-from adaptune.evaluation import evaluated as evaluated_
 from adaptune.evaluation import shown
 from adaptune.live.own_error import OwnError
 from adaptune.recording.config import SequenceConfig
@@ -105,7 +104,7 @@ def test_a_given_judge_is_measured_and_its_error_counts(
     hops = check.Hops.of([])
     measured = check.MeasuredReference(truth.stamps, truth.T_world_sensor, hops, doubt)
     monkeypatch.setattr(check.MeasuredReference, "error", lambda *_: OwnError(0.8, low, 1.0))
-    monkeypatch.setattr(evaluated_, "measure_reference", lambda *_: measured)
+    monkeypatch.setattr(check, "measure_reference", lambda *_: measured)
     made = longer(truth, 1.01)
     found = evaluated(bag, made, sub_trajectory=1.0)
     assert words in " ".join(found.words)
