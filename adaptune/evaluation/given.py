@@ -22,7 +22,7 @@ and poses of shape (n, 4, 4)."""
 class Convention(NamedTuple):
     """How the poses of trajectories are given."""
 
-    T_body_sensor: Poses | None = None  # the LiDAR's pose in their frame
+    T_body_sensor: Poses = to_pose(np.eye(4))  # the LiDAR's pose in their frame
     clock_offset: float = 0.0  # seconds to add to their stamps
     pose_time: Literal["stamp", "end"] = "stamp"  # the moment of a scan that they are of
 
@@ -34,7 +34,7 @@ def convention(extrinsic: Any, clock_offset: float, pose_time: Any) -> Conventio
     if pose_time not in ("stamp", "end"):
         raise AdaptuneError(f"pose_time: give stamp or end, not {pose_time}")
     try:
-        place = None if extrinsic is None else to_pose(extrinsic)
+        place = to_pose(np.eye(4) if extrinsic is None else extrinsic)
     except ValueError as error:
         raise AdaptuneError(f"extrinsic: {error}") from error
     return Convention(place, clock_offset, pose_time)
@@ -68,14 +68,9 @@ def read(name: str, given: Named, scans: RecordedSequence, by: Convention, span:
     if ends and not span:
         what = "its points have no times, which say when a scan ends; give --clock-offset"
         raise AdaptuneError(f"{scans.name}: {what} instead of --pose-time end")
-    found = _poses(given, scans)
-    T = (
-        found.T_world_sensor
-        if by.T_body_sensor is None
-        else found.T_world_sensor @ by.T_body_sensor
-    )
-    later = round(1e9 * by.clock_offset) + span * ends
-    found = Trajectory(found.stamps + later, T, found.max_gap)
+    found, later = _poses(given, scans), round(1e9 * by.clock_offset) + span * ends
+    T_world_sensor = found.T_world_sensor @ by.T_body_sensor
+    found = Trajectory(found.stamps + later, T_world_sensor, found.max_gap)
     scans.check_time(found, by.clock_offset, name, "--clock-offset")
     return found
 
