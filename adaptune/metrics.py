@@ -199,17 +199,20 @@ def kitti_error(
     return KittiError(*means, tuple(used), len(translation))
 
 
-def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
-    """Absolute pose error: root mean square of the distances after alignment, in metres.
+def absolute_errors(T_ref_sensor: Poses, T_odom_sensor: Poses) -> NDArray[np.float64]:
+    """Distances in metres after alignment, of shape (n,); NaN for poses without reference (NaN).
 
-    As ``evo_ape -a`` computes it: the translation part, after the least-squares alignment of the
-    positions (Umeyama, PAMI 1991). Poses without reference (NaN) do not count.
+    After the least-squares alignment of the positions (Umeyama, PAMI 1991).
     """
     known = ~np.isnan(T_ref_sensor[:, 0, 0])
-    ref, odom = T_ref_sensor[known, :3, 3], T_odom_sensor[known, :3, 3]
-    ref, odom = ref - ref.mean(axis=0), odom - odom.mean(axis=0)
-    R_ref_odom = nearest_rotation(odom, ref)
-    return float(np.sqrt(np.mean(np.sum((ref - odom @ R_ref_odom.T) ** 2, axis=1))))
+    ref, odom = (T[:, :3, 3] - T[known, :3, 3].mean(axis=0) for T in (T_ref_sensor, T_odom_sensor))
+    R_ref_odom = nearest_rotation(odom[known], ref[known])
+    return np.asarray(np.linalg.norm(ref - odom @ R_ref_odom.T, axis=1))
+
+
+def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
+    """Absolute pose error: root mean square of `absolute_errors`, as ``evo_ape -a`` has it."""
+    return float(np.sqrt(np.nanmean(absolute_errors(T_ref_sensor, T_odom_sensor) ** 2)))
 
 
 def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:

@@ -114,14 +114,19 @@ def of_stretches(logs: NDArray[np.float64], recordings: Sequence[str]) -> Ratio:
 
 
 def interval_of_mean(errors: NDArray[np.float64], block: int, own: float | None) -> Interval:
-    """95 % interval of a mean error; `own` is that of an estimated reference.
+    """95 % interval of a mean error; `own` is that of the reference.
 
-    If what the reference errs has nothing to do with the run, it adds to its error, in quadrature.
+    What that errs adds to the error of the run if both have nothing to do with each other, and
+    hides a part of it if they share it. Both ends are as unsure as that and chance together make
+    them, whose logarithms add in quadrature.
     """
-    found = ratio([Pair(np.stack([errors, np.ones_like(errors)]), block)]).interval
-    if found is None or own is None:
-        return found
-    return _without(found[0], ERROR_FACTOR * own), math.hypot(found[1], ERROR_FACTOR * own)
+    found = ratio([Pair(np.stack([errors, np.ones_like(errors)]), block)])
+    if found.interval is None or own is None:
+        return found.interval
+    mean, by_chance = found.value, math.log(found.interval[1] / found.value)
+    least, most = _without(mean, ERROR_FACTOR * own), math.hypot(mean, ERROR_FACTOR * own)
+    low = mean * math.exp(-math.hypot(by_chance, math.log(mean / least))) if least else 0.0
+    return low, mean * math.exp(math.hypot(by_chance, math.log(most / mean)))
 
 
 def along(pair: Pair) -> tuple[float, float, float]:

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from adaptune.errors import AdaptuneError
@@ -41,7 +42,6 @@ from adaptune.open3d import load
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import Scan
-from adaptune.reference.check import proposed_sub_trajectory
 from adaptune.reference.estimate import estimate_reference, estimated
 from adaptune.reference.graph import pass_over
 from adaptune.reference.judge import Reference
@@ -63,7 +63,8 @@ SETS: list[tuple[str, dict[str, float]]] = [
 ]
 RECORDED = ("hall", "town", "road", "city")
 WITHIN = 2.0  # times the best one's error; sets beyond are told apart by anything
-EVERY, CELL = 10, 0.5  # scans of a map, and metres between points of its clouds
+OVER = 5.0  # metres of a sub-trajectory
+EVERY, CELL = 20, 0.5  # scans of a map, and metres between points of its clouds
 Maps = Iterator[dict[str, float]]
 DATA = Path(os.environ.get("ADAPTUNE_TEST_DATA", "none"))
 
@@ -110,25 +111,37 @@ def judged(name: str, scans: Sequence[Scan], truth: Poses, maps: str | None) -> 
     """All sets on a course, by the estimated reference and by the truth."""
     found = estimated(name, pass_over(scans), scans)
     stamps = np.array([scan.stamp for scan in scans], np.int64)
-    trajectory = found.trajectory()
-    length = proposed_sub_trajectory(trajectory, training=0.0)
-    reference = Reference(trajectory, length, True, found.error(length))
-    judge = Judge(name, reference, "an estimated reference", int(stamps[0]), int(stamps[-1]))
     poses = [driven(*one, scans) for one in SETS]
-    rows: list[dict[str, Any]] = []
-    for (odometry, parameters), T in zip(SETS, poses, strict=True):
-        mine = Trajectory(stamps, T)
-        one = Judged(name, judge, mine, judge.stamps(mine))
-        errors = cap(sub_trajectory_rte(truth, T, length))
-        true = float(errors[np.isfinite(errors)].mean())
-        set_ = " ".join([odometry, *(f"{v:g}" for v in parameters.values())])
-        rows.append({"set": set_, "true": true, "judged": one.rte, "interval": one.interval})
+    reference = Reference(found.trajectory(), OVER, True, found.error(OVER))
+    rows = scored(name, reference, stamps, poses, truth)
     if maps is not None:
         for row, more in zip(rows, map_metrics(scans, poses, maps), strict=True):
             row.update(more)
-    errors = cap(sub_trajectory_rte(truth, found.known_poses, length))
-    own = {"says": reference.error, "is": float(np.nanmean(errors)), "length": length}
+    errors = cap(sub_trajectory_rte(truth, found.known_poses, OVER))
+    own = {"says": reference.error, "is": float(np.nanmean(errors))}
     return {"rows": rows, "unknown": found.unknown_share()} | own
+
+
+def scored(
+    name: str,
+    reference: Reference,
+    stamps: NDArray[np.int64],
+    poses: Sequence[Poses],
+    truth: Poses,
+) -> list[dict[str, Any]]:
+    """A row for each set: its true error, and what the reference says of it."""
+    judge = Judge(name, reference, "an estimated reference", int(stamps[0]), int(stamps[-1]))
+    rows = []
+    for (odometry, parameters), T in zip(SETS, poses, strict=True):
+        mine = Trajectory(stamps, T)
+        one = Judged(name, judge, mine, judge.stamps(mine))
+        errors = cap(sub_trajectory_rte(truth, T, OVER))
+        row: dict[str, Any] = {
+            "set": " ".join([odometry, *map("{:g}".format, parameters.values())])
+        }
+        row |= {"true": float(np.nanmean(errors)), "judged": one.rte}
+        rows.append(row | {"interval": one.interval, "blind": one.blind})
+    return rows
 
 
 def recorded(name: str) -> RecordedSequence:
@@ -144,9 +157,7 @@ def work(name: str, seed: int, length: float, maps: str | None) -> dict[str, Any
             course = Course(scenes=(kind,), length=length, seed=1000 * seed + number)  # type: ignore[arg-type]
             scans = list(simulate(course))
             return judged(name, scans, np.array([scan.T_world_sensor for scan in scans]), maps)
-        recording = RecordedSequence(
-            SequenceConfig(bag=f"{DATA}/{name}.bag", reference="/gt_poses")
-        )
+        recording = recorded(name)
         if name != "hall":
             return {"rows": [], "unknown": estimate_reference(recording).unknown_share()}
         scans = list(recording)
@@ -176,7 +187,7 @@ def report(found: dict[str, dict[str, Any]]) -> None:
         own = ""
         if one["rows"]:
             own = f"judge wrong by {one['is']:.3f} %, says {one['says']:.3f} %, "
-            own += f"over {one['length']:g} m; "
+            own += f"over {OVER:g} m; "
         print(f"{name:10} unknown {100 * one['unknown']:5.1f} %; {own}{one.get('refused', rank)}")
     for title, names in (
         ("all but gardens", [n for n in ranks if not n.startswith("garden")]),
@@ -188,18 +199,18 @@ def report(found: dict[str, dict[str, Any]]) -> None:
             if known:
                 least = f"median {np.median(known):.2f}, least {min(known):.2f}"
                 print(f"rank correlation, {title}, {judge}: {least}, {len(known)} courses")
-    rows = [row for one in found.values() for row in one["rows"]]
+    # Of the hall, the given reference is more wrong than the estimate.
+    rows = [row for name, one in found.items() if name not in RECORDED for row in one["rows"]]
     known = [row for row in rows if row["interval"] is not None]
     if not known:
         print("no interval: the courses are too short")
         return
     inside = [row["interval"][0] <= row["true"] <= row["interval"][1] for row in known]
     width = [row["interval"][1] / max(row["interval"][0], 1e-3) for row in known]
-    below = np.mean([row["interval"][0] == 0.0 for row in known])
     print(
         f"the interval holds the true mean for {np.mean(inside):.1%} of {len(known)} of "
         f"{len(rows)} trajectories; high / low: median {np.median(width):.2f}; better than can "
-        f"be told: {below:.1%}"
+        f"be told: {np.mean([row['blind'] for row in known]):.1%}"
     )
 
 
@@ -226,9 +237,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=71, help="of the worlds")
+    parser.add_argument("--seed", type=int, default=72, help="of the worlds")
     parser.add_argument("--courses", type=int, default=2, help="of each kind")
-    parser.add_argument("--length", type=float, default=60.0, help="metres of a course")
+    parser.add_argument("--length", type=float, default=40.0, help="metres of a course")
     parser.add_argument("--kinds", nargs="+", default=KINDS)
     parser.add_argument("--maps", help="folder of map-metrics")
     parser.add_argument("--workers", type=int, default=2)

@@ -3,7 +3,6 @@
 import logging
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, islice
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.recording.scan import Imu, Scan, joined
+from adaptune.recording.scan import Imu, Scan, joined, read_ahead
 from adaptune.selector import Periods
 from adaptune.study.config import RealTimeConfig
 from online.replay import Driver, ReplayRecord, Watch
@@ -72,18 +71,6 @@ def arrivals(
         imus, dropped = [], 0
 
 
-def _read_ahead(scans: Iterable[Scan]) -> Iterator[Scan]:
-    """Read in a thread; an error is raised here."""
-    source, pool = iter(scans), ThreadPoolExecutor(1)
-    try:
-        read = deque(pool.submit(next, source, None) for _ in range(_AHEAD))
-        while (scan := read.popleft().result()) is not None:
-            read.append(pool.submit(next, source, None))
-            yield scan
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
 def replay_in_real_time(
     scans: Iterable[Scan],
     odometry: OdometryInstance,
@@ -101,7 +88,7 @@ def replay_in_real_time(
     """
     record = ReplayRecord(settings.rate)
     drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
-    source = _read_ahead(scans)
+    source = read_ahead(scans, _AHEAD)
     first = list(islice(source, _AHEAD // 2))  # read before the first one is due
     every = chain(first, source)
     for arrival in arrivals(every, settings.rate, settings.queue, clock):

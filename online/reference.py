@@ -1,6 +1,5 @@
 """The reference beside the replays of a sequence."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -76,7 +75,6 @@ def read_contradictions(folder: Path) -> list[str]:
 def read_reference(study: Study, name: str) -> Reference:
     """Read the reference of a replayed sequence, if it has one, from beside its replays."""
     path = study.folder / "replays" / name / "reference.tum"
-    length = study.config.sub_trajectory
     trajectory = read_tum(path) if path.exists() else None
     if trajectory is not None:
         # Frames in a gap, and across a jump, have no label in training, and get none here.
@@ -86,6 +84,4 @@ def read_reference(study: Study, name: str) -> Reference:
         steps = np.diff(trajectory.stamps) * 1e-9
         rare = 3.0 * float(np.median(steps)) if len(steps) else 0.0
         trajectory = replace(trajectory, max_gap=min(gap, max(1.9, rare)))
-    stored = study.sequences.estimate(name)
-    error = math.nan if stored is None else stored.error(length)
-    return Reference(trajectory, length, stored is not None, None if math.isnan(error) else error)
+    return Reference.known(trajectory, study.config.sub_trajectory, study.sequences.estimate(name))

@@ -1,7 +1,7 @@
 """The command that says how good trajectories are."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -17,22 +17,11 @@ Words = Annotated[
         show_default=False,
     ),
 ]
-Most = Annotated[
-    str | None,
-    typer.Option("--max", metavar="PERCENT", help="End with 3 if an error surely exceeds that."),
-]
-Extrinsic = Annotated[
-    str | None,
-    typer.Option(metavar="POSE", help="The LiDAR's pose in the poses' frame: x y z qx qy qz qw."),
-]
-Offset = Annotated[float, typer.Option(metavar="SECONDS", help="To add to the poses' stamps.")]
-Moment = Annotated[
-    Literal["stamp", "end"], typer.Option(help="`end`: poses are of the ends of scans.")
-]
-Length = Annotated[
-    float | None,
-    typer.Option(help="Metres that errors are measured over.", show_default="as the path allows"),
-]
+Place = Annotated[str | None, typer.Option(help="LiDAR in the poses' frame: x y z qx qy qz qw.")]
+Offset = Annotated[float, typer.Option(help="Seconds to add to the poses' stamps.")]
+Moment = Annotated[Literal["stamp", "end"], typer.Option(help="`end`: poses of scans' ends.")]
+Length = Annotated[float | None, typer.Option(help="Metres that errors are measured over.")]
+Most = Annotated[str | None, typer.Option("--max", help="Percent; exit with 3 if surely more.")]
 Out = Annotated[Path, typer.Option(help="Folder of the page and the tables.", file_okay=False)]
 
 
@@ -40,7 +29,7 @@ def evaluate(
     words: Words,
     reference: Given = None,
     points: Points = None,
-    extrinsic: Extrinsic = None,
+    extrinsic: Place = None,
     clock_offset: Offset = 0.0,
     pose_time: Moment = "stamp",
     sub_trajectory: Length = None,
@@ -55,26 +44,21 @@ def evaluate(
     several trajectories, it says which is better, and how surely. Several bags with the same topic
     are a row each, the worst first.
     """
-    from adaptune.evaluation import evaluated
+    from adaptune.evaluation.evaluated import evaluate as evaluated
     from adaptune.evaluation.given import parted
     from adaptune.evaluation.shown import tables
 
     limit = None if most is None else percent(most, "max")
-    bags, trajectories = parted(words)
-    place = None if extrinsic is None else extrinsic.strip("[] ").replace(",", " ").split()
+    bags, named = parted(words)
+    of_poses = {"extrinsic": extrinsic, "clock_offset": clock_offset, "pose_time": pose_time}
+    given: dict[str, Any] = {
+        "reference": reference,
+        "points": points,
+        "reading": reading,
+    } | of_poses
     with progress() as show:
-        found = evaluated.evaluate(
-            bags,
-            *trajectories,
-            reference=reference,
-            points=points,
-            extrinsic=place,
-            clock_offset=clock_offset,
-            pose_time=pose_time,
-            sub_trajectory=sub_trajectory,
-            reading=reading,
-            out=out,
-            progress=show,
+        found = evaluated(
+            bags, *named, sub_trajectory=sub_trajectory, out=out, progress=show, **given
         )
     verdict = "below" if limit is None else found.verdict(limit)
     said = {"above": "Surely above", "below": "Below", "unclear": "TOO LITTLE TO TELL, at"}

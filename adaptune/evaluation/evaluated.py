@@ -1,37 +1,34 @@
 """Evaluate trajectories in one call: find the judge, judge, compare, and write the page."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from adaptune.errors import AdaptuneError
-from adaptune.evaluation.given import Convention, Named, convention, name_of, read
+from adaptune.evaluation.given import Convention, Named, by_name, convention, read
 from adaptune.evaluation.judged import Judge, Judged, pair_of
 from adaptune.evaluation.shown import Compared, in_words, write_evaluation
 from adaptune.paired import ratio
 from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.config import ESTIMATED
-from adaptune.recording.fleet import recordings_at
+from adaptune.recording.fleet import Reading
+from adaptune.recording.inspect import Inspection
 from adaptune.recording.recording import RecordedSequence, wants_estimate
-from adaptune.reference.check import measure_reference, proposed_sub_trajectory
-from adaptune.reference.diagnosis import contradiction, diagnose_trajectory
+from adaptune.reference import check, diagnosis
 from adaptune.reference.judge import Reference
 from adaptune.study.references import ensure_references
 from adaptune.study.sequences import StudySequences
 from adaptune.trajectory import Trajectory, read_trajectory
-from adaptune.tuning.asked import by_name, usable
-
-if TYPE_CHECKING:
-    from adaptune.recording.fleet import Reading
-    from adaptune.recording.inspect import Inspection
+from adaptune.tuning.asked import Asked, check_guarded, recorded
 
 OUT = Path("runs/evaluate")
+_SILENT = 0.1  # share of a recording that may lack poses where an error is surely below a bound
 _OWN = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 """Poses that systems seldom publish: where a bag has one such topic, it is its reference."""
 
@@ -55,11 +52,15 @@ class Evaluation:
         return [{key.lstrip("_"): v for key, v in one.row.items()} for one in self.judged]
 
     def verdict(self, most: float) -> Literal["above", "below", "unclear"]:
-        """Whether any error is surely above so many percent, or surely none is."""
+        """Whether any error is surely above so many percent, or surely none is.
+
+        What a trajectory does not give is not surely below.
+        """
         ends = [one.interval or (0.0, math.inf) for one in self.judged]
         if any(low > most for low, _ in ends):
             return "above"
-        return "below" if all(high <= most for _, high in ends) else "unclear"
+        whole = all(one.silent_share < _SILENT for one in self.judged)
+        return "below" if whole and all(high <= most for _, high in ends) else "unclear"
 
     def __repr__(self) -> str:
         return f"<Evaluation: {' '.join(self.words)} More: {self.page}>"
@@ -74,7 +75,7 @@ def evaluate(
     clock_offset: float = 0.0,
     pose_time: Literal["stamp", "end"] = "stamp",
     sub_trajectory: float | None = None,
-    reading: "Reading | None" = None,
+    reading: Reading | None = None,
     out: str | Path = OUT,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -102,55 +103,61 @@ def evaluate(
         Folder of the page, the tables and the estimated references; and what is called with how
         far each task is, by default bars.
     """
+    check_guarded("evaluate")
     if not trajectories:
         raise AdaptuneError("name a trajectory: a file of poses, or a topic")
     if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
         raise AdaptuneError("sub_trajectory: give metres, more than 0")
     given = [recordings] if isinstance(recordings, str | Path) else recordings
-    paths = recordings_at(list(map(Path, given)), reading)
-    for one in (reference, *trajectories) if len(paths) > 1 else ():
-        if not (one in (None, ESTIMATED) or (isinstance(one, str) and one[:1] == "/")):
-            what = f"is of one recording, and there are {len(paths)}; name topics that each has"
-            raise AdaptuneError(f"{name_of(one)}: {what}")
     by = convention(extrinsic, clock_offset, pose_time)
     chosen = None if reference is None else str(reference)
-    asked = _Asked(trajectories, chosen, sub_trajectory, by, Path(out))
+    paths = Asked([*map(Path, given)], "", points, chosen or ESTIMATED, reading=reading)
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
-        judge = asked.reference or ESTIMATED
-        named = by_name([usable(path, points, judge, show) for path in paths])
-        judged = [o for n, found in named.items() for o in _of_recording(n, found, asked, show)]
+        found, _ = recorded(paths, show, alike=False)
+        named = by_name(trajectories)
+        for one, of in named.items() if len(found) > 1 else ():
+            if not (isinstance(of, str) and of.startswith("/")) or Path(of).is_file():
+                what = f"is of one recording, and there are {len(found)}; name topics that each has"
+                raise AdaptuneError(f"{one}: {what}")
+        asked = _Asked(named, chosen, sub_trajectory, by, Path(out), show)
+        judged = [one for name in found for one in _of_recording(name, found[name], asked)]
     judged.sort(key=lambda one: -one.rte)
     pairs = _pairs(judged)
     return Evaluation(judged, pairs, write_evaluation(asked.out, judged, pairs))
 
 
 class _Asked(NamedTuple):
-    trajectories: Sequence[Named]
+    trajectories: Mapping[str, Named]
     reference: str | None
     length: float | None
     by: Convention
     out: Path
+    show: Progress
+
+    def length_of(self, judge: Trajectory) -> float:
+        """Metres over which errors are measured."""
+        return self.length or check.proposed_sub_trajectory(judge, training=0.0)
 
 
-def _of_recording(name: str, found: "Inspection", asked: _Asked, show: Progress) -> list[Judged]:
+def _of_recording(name: str, found: Inspection, asked: _Asked) -> list[Judged]:
     """All trajectories of a recording, judged."""
     if asked.reference is None:
         found.given["reference"] = _own_reference(found, asked.trajectories)
     scans, span = RecordedSequence(found.config()), found.scan.span if found.scan else 0
     # A trajectory that cannot be read is told before a reference is estimated.
-    poses = [read(given, scans, asked.by, span) for given in asked.trajectories]
-    judge = _judge(name, found, scans, asked, show)
+    poses = {n: read(n, one, scans, asked.by, span) for n, one in asked.trajectories.items()}
+    judge, place = _judge(name, found, scans, asked), asked.by.T_body_sensor
     judged = []
-    for number, (given, trajectory) in enumerate(zip(asked.trajectories, poses, strict=True), 1):
-        stamps, place = judge.stamps(trajectory), asked.by.T_body_sensor
-        cause = diagnose_trajectory(trajectory, judge.trajectory, stamps, span, place)
+    for called, trajectory in poses.items():
+        stamps = judge.stamps(trajectory)
+        cause = diagnosis.diagnose_trajectory(trajectory, judge.trajectory, stamps, span, place)
         cause = None if judge.doubt else cause
-        judged.append(Judged(name_of(given, number), judge, trajectory, stamps, cause))
+        judged.append(Judged(called, judge, trajectory, stamps, cause))
     return judged
 
 
-def _own_reference(found: "Inspection", trajectories: Sequence[Named]) -> str | None:
+def _own_reference(found: Inspection, trajectories: Collection[str]) -> str | None:
     """The recording's own poses, where they are not among what is judged; else an estimate."""
     if found.reference is not None and "reference" not in found.used:
         return None  # those of a folder
@@ -158,44 +165,48 @@ def _own_reference(found: "Inspection", trajectories: Sequence[Named]) -> str | 
     return own[0] if len(own) == 1 and own[0] not in trajectories else ESTIMATED
 
 
-def _judge(
-    name: str, found: "Inspection", scans: RecordedSequence, asked: _Asked, show: Progress
-) -> Judge:
+def _judge(name: str, found: Inspection, scans: RecordedSequence, asked: _Asked) -> Judge:
     """What judges: a given reference, or an estimated one.
 
     Where scans show that the recording's own is wrong, and nobody named it, it does not judge.
     """
-    length, called, doubt = asked.length, found.config().reference or "its own poses", ""
-    if not wants_estimate(found.config()) and (trajectory := scans.reference()) is not None:
-        doubt = _doubt(scans, trajectory, asked, show)
-        if doubt and asked.reference is None:
-            found.given["reference"] = ESTIMATED
-    sequences = StudySequences({name: found.config()}, {}, asked.out)
-    if wants_estimate(found.config()):
-        ensure_references(sequences, [name], length or 5.0, show)
-        trajectory = read_trajectory(sequences.estimate_path(name))
-        called = "an estimated reference" + f", as {called} {doubt}" * bool(doubt)
-        doubt = ""
-    assert trajectory is not None
-    stored = sequences.estimate(name)
-    length = length or proposed_sub_trajectory(trajectory, training=0.0)
-    error = math.nan if stored is None else stored.error(length)
-    own = None if math.isnan(error) else error
-    reference = Reference(trajectory, length, stored is not None, own)
-    begin, end = scans.source.span() or trajectory.stamps[[0, -1]].tolist()
-    unknown = stored.unknown if stored else ()
-    return Judge(name, reference, called, begin, end, unknown, doubt)
+    config, error, doubt = found.config(), None, ""
+    called = config.reference or "its own poses"
+    given = None if wants_estimate(config) else scans.reference()
+    stored = StudySequences({name: config}, {}, asked.out).estimate(name)
+    if given is not None and stored is None:
+        error, doubt = _against(scans, given, asked)
+    if given is None or (doubt and asked.reference is None):
+        found.given["reference"] = ESTIMATED
+        sequences = StudySequences({name: found.config()}, {}, asked.out)
+        length, must = asked.length or 5.0, given is None
+        if why := ensure_references(sequences, [name], length, asked.show, must).get(name):
+            doubt += f", and none can be estimated: {why}"
+        else:
+            given, stored = read_trajectory(sequences.estimate_path(name)), sequences.estimate(name)
+            called = "an estimated reference" + f" (as {called} {doubt})" * bool(doubt)
+            doubt = ""
+    assert given is not None  # else there is an error
+    reference = Reference.known(given, asked.length_of(given), stored)
+    reference = reference if stored else reference._replace(error=error)
+    begin, end = scans.source.span() or given.stamps[[0, -1]].tolist()
+    return Judge(name, reference, called, begin, end, stored.unknown if stored else (), doubt)
 
 
-def _doubt(scans: RecordedSequence, trajectory: Trajectory, asked: _Asked, show: Progress) -> str:
-    """What scans say against a given reference, in words; empty if nothing."""
-    if asked.reference is None:  # as `tune` does; who names one insists on it
-        measured = measure_reference(scans, trajectory, partial(show, "registering"))
-        length = asked.length or proposed_sub_trajectory(trajectory, training=0.0)
-        if (error := measured.error(length)) is not None:
-            return f"is wrong by {error.mean:.2g} %" if measured.is_noisy(length) else ""
-    cause = contradiction(scans, trajectory)
-    return "" if cause is None else f"contradicts the scans ({cause})"
+def _against(scans: RecordedSequence, given: Trajectory, asked: _Asked) -> tuple[float | None, str]:
+    """Percent by which a given reference surely errs, and in words what the scans say against it.
+
+    Both are empty where they show nothing.
+    """
+    measured = check.measure_reference(scans, given, partial(asked.show, "registering"))
+    error = measured.error(length := asked.length_of(given))
+    if error is None or measured.is_noisy(length):
+        motions = diagnosis.measured_motions(scans, len(measured.stamps))
+        if (cause := diagnosis.diagnose_reference(given, measured.stamps, motions)) is not None:
+            return None, f"contradicts the scans ({cause})"
+        if error is not None and asked.reference is None:
+            return error.low, f"is wrong by {error.mean:.2g} %"
+    return None if error is None or measured.doubt else error.low, ""
 
 
 def _pairs(judged: Sequence[Judged]) -> list[Compared]:

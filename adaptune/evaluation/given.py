@@ -22,46 +22,56 @@ and poses of shape (n, 4, 4)."""
 class Convention(NamedTuple):
     """How the poses of trajectories are given."""
 
-    T_body_sensor: Poses | None = None  # the LiDAR's pose in their frame
+    T_body_sensor: Poses = to_pose(np.eye(4))  # the LiDAR's pose in their frame
     clock_offset: float = 0.0  # seconds to add to their stamps
     pose_time: Literal["stamp", "end"] = "stamp"  # the moment of a scan that they are of
 
 
 def convention(extrinsic: Any, clock_offset: float, pose_time: Any) -> Convention:
     """What a user says of the poses; an AdaptuneError says what is wrong with it."""
+    if isinstance(extrinsic, str):
+        extrinsic = extrinsic.strip("[] ").replace(",", " ").split()
     if pose_time not in ("stamp", "end"):
         raise AdaptuneError(f"pose_time: give stamp or end, not {pose_time}")
     try:
-        place = None if extrinsic is None else to_pose(extrinsic)
+        place = to_pose(np.eye(4) if extrinsic is None else extrinsic)
     except ValueError as error:
         raise AdaptuneError(f"extrinsic: {error}") from error
     return Convention(place, clock_offset, pose_time)
 
 
 def parted(words: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """Which words are recordings, and which trajectories; the first is a recording."""
-    bags = [w for i, w in enumerate(words) if not i or Path(w).suffix in BAG_SUFFIXES]
-    bags += [w for w in words if w not in bags and Path(w).is_dir()]
-    return [Path(w) for w in words if w in bags], [w for w in words if w not in bags]
+    """Which words are recordings, and which trajectories; of neither kind, the first is one."""
+    bags = [w for w in words if Path(w).suffix in BAG_SUFFIXES or Path(w).is_dir()] or words[:1]
+    return [Path(w) for w in bags], [w for w in words if w not in bags]
 
 
-def name_of(given: Named, number: int = 1) -> str:
-    """What a trajectory is called."""
+def by_name(given: Sequence[Named]) -> dict[str, Named]:
+    """Trajectories by what they are called: a file by its name, where no other one has it."""
+    names = [_name(one, number) for number, one in enumerate(given, 1)]
+    pairs = zip(names, given, strict=True)
+    return {str(one) if names.count(name) > 1 else name: one for name, one in pairs}
+
+
+def _name(given: Named, number: int) -> str:
     if not isinstance(given, str | Path):
         return f"trajectory {number}"
     return Path(given).name if Path(given).is_file() else str(given)
 
 
-def read(given: Named, scans: RecordedSequence, by: Convention, span: int) -> Trajectory:
+def read(name: str, given: Named, scans: RecordedSequence, by: Convention, span: int) -> Trajectory:
     """Read a trajectory as poses of the LiDAR, at the stamps of scans of `span` nanoseconds.
 
     An AdaptuneError says why it is none of this recording.
     """
-    found = _poses(given, scans)
-    T, later = found.T_world_sensor, round(1e9 * by.clock_offset) + span * (by.pose_time == "end")
-    T = T if by.T_body_sensor is None else T @ by.T_body_sensor
-    found = Trajectory(found.stamps + later, T, found.max_gap)
-    scans.check_time(found, name_of(given))
+    ends = by.pose_time == "end"
+    if ends and not span:
+        what = "its points have no times, which say when a scan ends; give --clock-offset"
+        raise AdaptuneError(f"{scans.name}: {what} instead of --pose-time end")
+    found, later = _poses(given, scans), round(1e9 * by.clock_offset) + span * ends
+    T_world_sensor = found.T_world_sensor @ by.T_body_sensor
+    found = Trajectory(found.stamps + later, T_world_sensor, found.max_gap)
+    scans.check_time(found, by.clock_offset, name, "--clock-offset")
     return found
 
 

@@ -1,6 +1,5 @@
 """A trajectory as a reference judges it: how wrong it is, where, and how surely."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.geometry import Poses
 from adaptune.metrics import LOST_ABOVE, span, travelled
-from adaptune.paired import ERROR_FACTOR, Interval, Pair, interval_of_mean
+from adaptune.paired import ERROR_FACTOR, Interval, Pair, in_cell, interval_of_mean
 from adaptune.recording.poses import sound
 from adaptune.reference.carried import stands
 from adaptune.reference.check import FEWEST, LONGER
@@ -20,6 +19,8 @@ from adaptune.reference.judge import Reference
 from adaptune.trajectory import Trajectory
 
 _PAUSE = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
+_RARE = 1.6  # times the judge's step, from which on a trajectory gives few poses, as keyframes
+_MOMENTS = 2000  # at which it is asked whether the judge knows a pose
 
 
 class Judge(NamedTuple):
@@ -115,8 +116,7 @@ class Judged:
     @property
     def blind(self) -> bool:
         """Whether the judge is about as wrong as what it judges."""
-        low = self.interval[0] if self.interval else math.inf
-        return low == 0.0 or self.rte < ERROR_FACTOR * (self.judge.reference.error or 0.0)
+        return self.rte < ERROR_FACTOR * (self.judge.reference.error or 0.0)
 
     @cached_property
     def drift(self) -> tuple[float, float]:
@@ -131,14 +131,26 @@ class Judged:
     @cached_property
     def unknown_share(self) -> float:
         """Share of its time in which the judge knows no pose."""
-        begin, end = max(int(self.trajectory.stamps[0]), self.judge.begin), int(self.stamps[-1])
-        judge = self.judge.trajectory
-        steps = np.diff([begin, *judge.stamps[(judge.stamps > begin) & (judge.stamps < end)], end])
-        return float(steps[steps > judge.max_gap * 1e9].sum() / max(end - begin, 1))
+        begin = max(self.trajectory.stamps[0], self.judge.begin)
+        at = np.linspace(begin, self.stamps[-1], _MOMENTS).astype(np.int64)
+        return float(np.isnan(self.judge.trajectory.at(at)[:, 0, 0]).mean())
+
+    @cached_property
+    def silent(self) -> NDArray[np.float64]:
+        """From when to when it gives nothing, in seconds of the recording, of shape (m, 2)."""
+        ends = np.array([self.judge.begin, *self.trajectory.stamps, self.judge.end])
+        steps = np.column_stack([ends[:-1], ends[1:]]) - self.judge.begin
+        usual = max(1e9, _PAUSE * float(np.median(np.diff(ends))))
+        return np.asarray(1e-9 * steps[np.diff(ends) > usual])
+
+    @property
+    def silent_share(self) -> float:
+        """Share of the recording in which it gives nothing."""
+        return float(1e9 * np.diff(self.silent).sum() / max(self.judge.end - self.judge.begin, 1))
 
     @cached_property
     def faults(self) -> list[Finding]:
-        """Where it jumps, stands still while the robot moves, or gives nothing."""
+        """Where it jumps, stands still while the robot moves, or gives nothing, or little."""
         judge, stamps = self.judge, self.trajectory.stamps
         found = [f._replace(mend="") for f in sound(self.trajectory, judge.begin, name="it")[1]]
         if found and found[-1].seconds is None:
@@ -148,13 +160,16 @@ class Judged:
                 raise AdaptuneError(f"{self.title}: {what}")
         still = stands(self.truth, self.odometry.T_world_sensor)
         edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
-        what = "it stands still while the robot moves"
-        spans = [(what, *self.seconds[edge - (0, 1)]) for edge in edges]
-        ends = (np.array([min(judge.begin, stamps[0]), *stamps, judge.end]) - judge.begin) * 1e-9
-        usual = max(1.0, _PAUSE * float(np.median(np.diff(ends))))
-        long = np.flatnonzero(np.diff(ends) > usual)
-        spans += [("it gives nothing", *ends[i : i + 2]) for i in long]
-        return found + [Finding((), what, seconds=(float(a), float(b))) for what, a, b in spans]
+        step, of_judge = (np.median(np.diff(t)) for t in (stamps, judge.trajectory.stamps))
+        for what, spans in (
+            ("it stands still while the robot moves", self.seconds[edges.clip(max=len(still) - 1)]),
+            ("it gives nothing", self.silent),
+        ):
+            found += [Finding((), what, seconds=(a, b)) for a, b in spans.tolist()]
+        if (times := step / of_judge) > _RARE:
+            what = f"it gives one pose for {times:.2g} of the judge's, and is judged there alone"
+            found.append(Finding((), what))
+        return found
 
     @property
     def row(self) -> dict[str, Any]:
@@ -165,7 +180,7 @@ class Judged:
             "recording": self.judge.recording,
             "trajectory": self.name,
             "RTE [%]": self.rte,
-            "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
+            "95 %": in_cell(self.interval),
             "drift [m/100 m]": drift,
             "worst [%]": float(self.around[worst]),
             "at [s]": float(self.seconds[worst]),

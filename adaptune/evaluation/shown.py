@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adaptune.evaluation.judged import Judged
-from adaptune.geometry import nearest_rotation
+from adaptune.metrics import absolute_errors
 from adaptune.paired import Ratio, in_cell
 from adaptune.reference.diagnosis import OWN_ERROR
 from adaptune.reference.judge import columns_of
@@ -17,11 +17,9 @@ from adaptune.report.tables import Listing, write_rows
 
 _SENTENCES, _SAID = 5, 2
 """Of the summary; and faults, and trajectories, that are told one by one in it."""
+_NONE = 0.005  # percent of an error that is none
 _PLACES, _PATHS = 400, 6  # points of a path, and paths, that are drawn
-_ALIKE = (
-    "A reference from scans is blind to what all registrations get wrong alike, as a scale of the "
-    "ranges; a trajectory that comes from registrations of the same scans shares that."
-)
+_ALIKE = "what all registrations of these scans get wrong alike, as a scale of the ranges"
 _CAPTION = (
     "RTE: mean error of sub-trajectories, in percent of their length. Worst: where and when the "
     "sub-trajectories had the greatest error. Unknown: share of the time without a reference."
@@ -66,9 +64,15 @@ def in_words(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[str]:
 
 def _error(one: Judged) -> str:
     """The error of a trajectory, how sure it is, and who says so."""
-    reference, ends = one.judge.reference, one.interval
-    own = f"whose own error, about {reference.error or 0.0:.2g} %, is in the interval"
-    own = "whose own error is not known" if reference.error is None else own
+    reference, ends, own = one.judge.reference, one.interval, "whose own error "
+    if reference.error is None:
+        own += "is not known"
+    elif reference.estimated:
+        own += f"is in the interval, about {reference.error:.2g} %, but not {_ALIKE}"
+    elif reference.error < _NONE:
+        own += "registrations do not show"
+    else:
+        own += f"is in the interval as far as registrations show it, {reference.error:.2g} %"
     by = f"over {reference.length:g} m, by {one.judge.name}, {own}."
     if one.blind:
         most = max(ends[1] if ends else 0.0, one.rte)
@@ -78,7 +82,7 @@ def _error(one: Judged) -> str:
 
 
 def _listed(findings: Sequence[object]) -> str:
-    more = f"; and {len(findings) - _SAID} times more" * (len(findings) > _SAID)
+    more = f"; and {len(findings) - _SAID} more" * (len(findings) > _SAID)
     return "; ".join(map(str, findings[:_SAID])) + more
 
 
@@ -91,22 +95,22 @@ def tables(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[Listing]
         for one in judged
     ]
     rows = [
-        {"trajectory": p.better, "against": p.other, "ratio": p.ratio.value}
-        | {"95 %": in_cell(p.ratio.interval)}
-        for p in pairs
+        {"trajectory": best, "against": other, "ratio": of.value, "95 %": in_cell(of.interval)}
+        for best, other, of in pairs
     ]
-    return [
+    found = [
         Listing(title, [one.row for one in judged], _CAPTION),
-        Listing("Errors as evo and KITTI's benchmark have them", of_others, _ALIKE),
+        Listing("Errors as evo and KITTI's benchmark have them", of_others),
         Listing("The best against each other one", rows),
     ]
+    return found if pairs else found[:2]
 
 
 def write_evaluation(out: Path, judged: Sequence[Judged], pairs: Sequence[Compared]) -> Path:
     """Write the page, its charts, and the table as CSV and JSON; returns the page."""
     notes = [f"{one.title}: {f}." for one in judged for f in (one.cause, *one.faults) if f]
-    made = tuple(t for t in tables(judged, pairs) if t.rows)
-    section = PageSection("Errors", tuple(notes), tuple(_charts(judged)), made)
+    made = tuple(_charts(judged)), tuple(tables(judged, pairs))
+    section = PageSection("Errors", tuple(notes), *made)
     by = f"Judged by {', '.join(dict.fromkeys(one.judge.name for one in judged))}"
     path = out / "evaluation.html"
     write_page(path, Page("Evaluation", by, tuple(in_words(judged, pairs)), (section,)))
@@ -123,7 +127,10 @@ def _charts(judged: Sequence[Judged]) -> Iterator[Chart]:
         time, length = Axis("time [s]"), of[0].judge.reference.length
         error = Axis(f"RTE over {length:g} m [%]", log=True)
         around = tuple(Line(one.seconds, one.around, one.name) for one in of)
-        apart = tuple(Line(one.seconds, _apart(one), one.name) for one in of)
+        apart = tuple(
+            Line(one.seconds, absolute_errors(one.truth, one.odometry.T_world_sensor), one.name)
+            for one in of
+        )
         panels = Panel(time, error, around), Panel(time, Axis("from the judge [m]"), apart)
         about = "Above: as in the paths. Below: distance of the paths, aligned as a whole."
         yield Chart(f"{name}-errors", f"{name}: error over time", panels, about, shared_x=True)
@@ -135,11 +142,3 @@ def _path(one: Judged) -> Panel:
     some = some[np.isfinite(one.around[some])]
     drawn = Line(x, y, "", faint=True), Points(x[some], y[some], "", one.around[some], "error [%]")
     return Panel(Axis("x [m]"), Axis("y [m]"), drawn, one.title, equal=True)
-
-
-def _apart(one: Judged) -> list[float]:
-    """Metres from the judge's path after alignment, of shape (n,); NaN where it is unknown."""
-    known = np.isfinite(one.truth[:, 0, 0])
-    both = one.truth, one.odometry.T_world_sensor
-    ref, own = (T[:, :3, 3] - T[known, :3, 3].mean(axis=0) for T in both)
-    return list(np.linalg.norm(ref - own @ nearest_rotation(own[known], ref[known]).T, axis=1))

@@ -1,6 +1,6 @@
 """Poses in ROS messages."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -99,22 +99,21 @@ def chained(moving: Sequence[Any], fixed: Sequence[Any], parent: str, child: str
 
     `moving` and `fixed` are transforms. A ValueError says why there is no chain.
     """
-    links: dict[str, tuple[str, list[Pose]]] = {}
-    for t in (*fixed, *moving):
-        above, below = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
-        if links.setdefault(below, (above, []))[0] != above:
-            both = f"{links[below][0]} and {above}"
-            raise ValueError(f"{below} has two parents, {both}: two nodes publish it; record one")
-        links[below][1].extend(_transforms([t]))
+    links: dict[str, dict[str, list[Pose]]] = defaultdict(lambda: defaultdict(list))
+    for t in moving:
+        links[t.child_frame_id.lstrip("/")][t.header.frame_id.lstrip("/")] += _transforms([t])
     for t in fixed:
-        _, poses = links[t.child_frame_id.lstrip("/")]
-        poses[:] = [(stamp, *poses[-1][1:]) for stamp in (_BEGIN, _END)]
+        always = [(stamp, *_transforms([t])[0][1:]) for stamp in (_BEGIN, _END)]
+        links[t.child_frame_id.lstrip("/")][t.header.frame_id.lstrip("/")] = always
     way, frame = list[Trajectory](), child.lstrip("/")
     while frame != parent.lstrip("/") or not way:
         if frame not in links or len(way) > len(links):
-            known = ", ".join(sorted({*links, *(above for above, _ in links.values())}))
+            known = ", ".join(sorted({*links, *(above for of in links.values() for above in of)}))
             raise ValueError(f"no chain leads from {parent} to {child}; there is {known}")
-        frame, poses = links[frame]
+        if len(links[frame]) > 1:
+            both = " and ".join(links[frame])
+            raise ValueError(f"{frame} has two parents, {both}: two nodes publish it; record one")
+        ((frame, poses),) = links[frame].items()
         if (link := usable(poses)[0]) is None:
             raise ValueError(f"{poses[0][1]} has no pose that is finite")
         way.append(link)

@@ -385,7 +385,7 @@ class RecordedSequence:
         """The poses that a robot can have had; a SequenceError if they are of another time."""
         if len(trajectory) > 1 and (angles := in_angles(trajectory)) is not None:
             raise SequenceError(f"{self.name}: {angles}")
-        self.check_time(trajectory)
+        self.check_time(trajectory, self._config.clock_offset)
         if (span := self.source.span()) is None:
             return trajectory
         # A gap shorter than the time between two scans would not be noticed.
@@ -395,29 +395,36 @@ class RecordedSequence:
             _warn(self.name, str(finding))
         return trajectory
 
-    def check_time(self, trajectory: Trajectory, what: str = "the reference") -> None:
-        """Refuse poses of another time than the scans, by a SequenceError that says by how much."""
+    def check_time(
+        self,
+        trajectory: Trajectory,
+        offset: float,
+        what: str = "the reference",
+        key: str = "clock_offset",
+    ) -> None:
+        """Refuse poses of another time than the scans, by a SequenceError that says by how much.
+
+        Their stamps already include the `offset`, seconds, which is set by a `key` or an option.
+        """
         span, (begin, end) = self.source.span(), trajectory.stamps[[0, -1]].tolist()
         if span is None or (begin <= span[1] and end >= span[0]):
             return
         times = [f"{stamp * 1e-9:.3f} s" for stamp in (begin, end, *span)]
         raise SequenceError(
             f"{self.name}: {what} covers {times[0]} to {times[1]}, the scans cover "
-            f"{times[2]} to {times[3]}: set `clock_offset` to the seconds to add to its stamps"
-            f"{self._proposal(trajectory)}"
+            f"{times[2]} to {times[3]}: set `{key}` to the seconds to add to its stamps"
+            f"{self._proposal(trajectory, offset, key)}"
         )
 
-    def _proposal(self, trajectory: Trajectory) -> str:
+    def _proposal(self, trajectory: Trajectory, offset: float, key: str) -> str:
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
             turns = compensation.turning_of(islice(self._decode(Counter(), Content()), _MOST_SCANS))
         except AdaptuneError:
             return ""
-        if (offset := compensation.clock_offset(trajectory, *turns)) is None:
+        if (more := compensation.clock_offset(trajectory, *turns)) is None:
             return ""
-        # The stamps already include the offset that is set.
-        offset += self._config.clock_offset
-        return f" (the scans show the same motion with clock_offset: {offset:.3f})"
+        return f" (the scans show the same motion with {key}: {offset + more:.3f})"
 
 
 @once

@@ -1,7 +1,8 @@
 """What recordings consist of: scans, measurements of an IMU, and the formats that give them."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -177,6 +178,21 @@ def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArr
     """Number stretches of all recordings from 0 on, by place and stretch of each frame: (n,)."""
     _, number = np.unique(np.stack([place, stretch], axis=1), axis=0, return_inverse=True)
     return np.asarray(number.ravel())
+
+
+def read_ahead(scans: Iterable[Scan], n: int) -> Iterator[Scan]:
+    """Read so many scans ahead in a thread; an error is raised here."""
+    source, pool = iter(scans), ThreadPoolExecutor(1)
+    read = deque(pool.submit(next, source, None) for _ in range(n))
+    try:
+        while (scan := read.popleft().result()) is not None:
+            read.append(pool.submit(next, source, None))
+            yield scan
+    finally:
+        _ = [one.cancel() for one in read]
+        # Where it was opened: SQLite lets no other thread close a bag.
+        pool.submit(getattr(source, "close", lambda: None))
+        pool.shutdown(wait=False)
 
 
 class Frame(NamedTuple):

@@ -578,20 +578,12 @@ def diagnose_trajectory(
     if ends_fit is not None and (cause is None or "clock" in cause.what):
         return ends_fit._replace(where=())
     if cause is not None:
-        return cause._replace(what=cause.what.replace("registrations of scans", "the reference"))
+        what = cause.what.replace(", by registrations of scans", " from the reference")
+        return cause._replace(what=what)
     if (differ := _mean(mismatch(T_odom_sensor, hops))) > _APART:
-        what = f"over some metres, most motions differ from the reference's by {differ:.0f} %"
+        what = f"over some metres they differ by {differ:.0f} % from the reference"
         return Finding((), what, "they are of another drive, or lost nearly everywhere")
     return None
-
-
-def contradiction(scans: Recording, reference: Trajectory) -> Finding | None:
-    """Why a reference contradicts registrations of scans, see `diagnose_reference`."""
-    stamps: list[int] = []
-    passing = (stamps.append(scan.stamp) or scan for scan in scans)  # type: ignore[func-returns-value]
-    hops = measured_motions(passing, scans.n_messages)
-    deque(passing, 0)
-    return diagnose_reference(reference, np.array(stamps, np.int64), hops)
 
 
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

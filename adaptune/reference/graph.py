@@ -22,7 +22,7 @@ from adaptune.odometry.base import InProcess
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.tracker import WARM_UP, Tracker
-from adaptune.recording.scan import Scan
+from adaptune.recording.scan import Scan, read_ahead
 from adaptune.space import ParameterSet, Selection
 
 POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
@@ -114,7 +114,8 @@ class _Anchor(NamedTuple):
 
 
 _AHEAD = 8
-"""Scans by which the consensus may be ahead of what is registered directly."""
+"""Scans by which the consensus may be ahead of what is registered directly, and behind those that
+are read: most bags are packed."""
 
 
 def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: None) -> Pass:
@@ -129,7 +130,7 @@ def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: 
     motions: list[Poses] = []
     waiting: deque[Future[None]] = deque()
     with processes(1, [__name__]) as beside:
-        for scan in scans:
+        for scan in read_ahead(scans, _AHEAD):
             T_odom_sensor, T_previous_current = consensus.register(scan)
             waiting.append(beside.submit(_add, scan, T_odom_sensor, T_previous_current))
             stamps.append(scan.stamp)

@@ -18,6 +18,7 @@ from adaptune.metrics import (
     sub_trajectory_rte,
     window_ends,
 )
+from adaptune.reference.stored import StoredEstimate
 from adaptune.trajectory import Trajectory
 
 
@@ -60,7 +61,15 @@ class Reference(NamedTuple):
     trajectory: Trajectory | None  # None where nothing is known
     length: float  # metres of a sub-trajectory
     estimated: bool = False  # whether it was computed from the recording
-    error: float | None = None  # estimated mean RTE of an estimated one, percent
+    error: float | None = None  # its own mean RTE in percent, as far as it is known
+
+    @classmethod
+    def known(
+        cls, trajectory: Trajectory | None, length: float, stored: StoredEstimate | None
+    ) -> "Reference":
+        """The reference with these poses, and with the error of an estimated one."""
+        error = np.nan if stored is None else stored.error(length)
+        return cls(trajectory, length, stored is not None, None if np.isnan(error) else error)
 
     @property
     def block(self) -> int:

@@ -100,7 +100,8 @@ def recorded(
     resolved = [path.resolve() for path in paths]
     for path in paths:
         if resolved.count(path.resolve()) > 1:
-            raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
+            why = "; the test needs a recording of its own" * alike
+            raise AdaptuneError(f"{path}: is named twice{why}")
     if asked.reference == NO_REFERENCE:
         raise AdaptuneError(
             "--reference none: errors are measured by a reference; leave it out, and one is "
@@ -116,19 +117,13 @@ def recorded(
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
     if alike:
         check_alike(inspections)
-    named = by_name(inspections)
-    return named, list(named)[len(paths) - len(tested) :]
-
-
-def by_name(inspections: "Sequence[Inspection]") -> "dict[str, Inspection]":
-    """Recordings by the names of their sequences, of which no two are the same."""
     named: dict[str, Inspection] = {}
     for inspection in inspections:
         path = inspection.path
         longer = plain_name(path.with_name(f"{path.parent.name}_{path.name}"))
         names = chain([inspection.name, longer], (f"{inspection.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = inspection
-    return named
+    return named, list(named)[len(paths) - len(tested) :]
 
 
 def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":

@@ -7,8 +7,11 @@ import pytest
 import adaptune
 from adaptune.errors import AdaptuneError
 from adaptune.evaluation import shown
+from adaptune.live.own_error import OwnError
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
+from adaptune.reference import check
+from adaptune.reference.estimated import EstimateError
 from adaptune.trajectory import Trajectory, write_tum
 
 
@@ -50,7 +53,7 @@ def test_a_trajectory_is_judged_by_the_reference_that_is_named(bag, truth, tmp_p
     low, high = one.interval
     assert low <= one.rte <= high
     assert found.words[0].startswith("trajectory 1 on one is wrong by 2.3")
-    assert "by /truth, whose own error is not known." in found.words[0]
+    assert "by /truth, whose own error registrations do not show." in found.words[0]
     assert len(found.words) <= 5
     (row,) = json.loads((tmp_path / "evaluation.json").read_text())
     assert row["RTE [%]"] == found.rows[0]["RTE [%]"] == pytest.approx(one.rte)
@@ -69,7 +72,10 @@ def test_without_a_reference_one_is_estimated_once_and_its_error_counts(
     (one,) = found.judged
     own = one.judge.reference.error
     assert own == pytest.approx(0.3, abs=0.05)
-    assert "by an estimated reference, whose own error, about 0.3" in found.words[0]
+    assert (
+        "by an estimated reference, whose own error is in the interval, about 0.3" in found.words[0]
+    )
+    assert "but not what all registrations of these scans get wrong alike" in found.words[0]
     by_truth = evaluated(bag, tmp_path / "mine.tum", **(options | {"reference": "/truth"})).judged[
         0
     ]
@@ -83,12 +89,61 @@ def test_without_a_reference_one_is_estimated_once_and_its_error_counts(
     assert good.verdict(0.01) == "unclear"
 
 
+@pytest.mark.parametrize(
+    ("low", "doubt", "words", "judge"),
+    [
+        (0.4, "", "is in the interval as far as registrations show it, 0.4 %", "/truth"),
+        (0.4, "it gives 2 scans a second", "whose own error is not known", "/truth"),
+        (0.6, "", "(as /truth is wrong by 0.8 %), whose own error", "an estimated reference (as"),
+    ],
+)
+def test_a_given_judge_is_measured_and_its_error_counts(
+    bag, truth, tmp_path, monkeypatch, low, doubt, words, judge
+):
+    estimates.install(monkeypatch)
+    hops = check.Hops.of([])
+    measured = check.MeasuredReference(truth.stamps, truth.T_world_sensor, hops, doubt)
+    monkeypatch.setattr(check.MeasuredReference, "error", lambda *_: OwnError(0.8, low, 1.0))
+    monkeypatch.setattr(check, "measure_reference", lambda *_: measured)
+    made = longer(truth, 1.01)
+    found = evaluated(bag, made, sub_trajectory=1.0)
+    assert words in " ".join(found.words)
+    (one,) = found.judged
+    assert one.judge.name.startswith(judge)
+    (exact,) = evaluated(bag, made, sub_trajectory=1.0, reference="/truth").judged
+    wide = exact.interval[1] - exact.interval[0]
+    assert (wide > 0.1) is (not doubt)
+    estimates.install(monkeypatch).refusal = EstimateError("the scene may be too bare")
+    (one,) = evaluated(bag, made, sub_trajectory=1.0, out=tmp_path).judged
+    assert one.judge.name == "/truth"
+    assert ("none can be estimated: sequences.one: " in one.judge.doubt) is (low > 0.5)
+
+
+def test_a_judge_that_contradicts_the_scans_says_so_where_it_is_named(bag, truth, tmp_path):
+    turned = np.eye(4)
+    turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    write_tum(tmp_path / "turned.tum", Trajectory(truth.stamps, truth.T_world_sensor @ turned))
+    found = evaluated(bag, truth, reference=tmp_path / "turned.tum", sub_trajectory=1.0)
+    assert "turned.tum contradicts the scans (over some metres they differ by " in found.words[0]
+    assert "other axes" in found.words[0]
+    assert found.judged[0].cause is None
+
+
 def test_what_is_judged_is_not_its_own_judge(bag, monkeypatch):
     estimates.install(monkeypatch)
     (one,) = evaluated(bag, "/truth").judged
     assert one.judge.name == "an estimated reference"
     (one,) = evaluated(bag, longer(one.trajectory, 1.01)).judged
     assert one.judge.name == "/truth"
+
+
+def test_two_files_of_one_name_are_two(bag, truth, tmp_path):
+    for folder, factor in (("one", 1.01), ("two", 1.02)):
+        (tmp_path / folder).mkdir()
+        write_tum(tmp_path / folder / "a.tum", longer(truth, factor))
+    both = [str(tmp_path / folder / "a.tum") for folder in ("one", "two")]
+    found = evaluated(bag, *both, reference="/truth", sub_trajectory=1.0)
+    assert [(pair.better, pair.other) for pair in found.pairs] == [tuple(both)]
 
 
 def test_which_of_several_is_better_or_that_nobody_can_tell(bag, truth):
@@ -131,9 +186,14 @@ def test_faults_gaps_and_parts_are_told(bag, truth):
     (one,) = evaluated(bag, late, reference="/truth", sub_trajectory=1.0).judged
     (fault,) = one.faults
     assert str(fault) == "it gives nothing, from 0.7 to 2.4 s"
+    rare = Trajectory(truth.stamps[::5], truth.T_world_sensor[::5])
+    (one,) = evaluated(bag, rare, reference="/truth", sub_trajectory=1.0).judged
+    assert "one pose for 5 of the judge's, and is judged there alone" in str(one.faults[0])
     part = Trajectory(truth.stamps[:25], truth.T_world_sensor[:25])
     found = evaluated(bag, part, reference="/truth", sub_trajectory=1.0)
     assert "it gives nothing, from 2.4 to 3.9 s" in " ".join(found.words)
+    assert found.verdict(5.0) == "unclear"
+    assert evaluated(bag, truth, reference="/truth", sub_trajectory=1.0).verdict(5.0) == "below"
 
 
 def test_where_the_judge_knows_nothing_is_told(bag, truth, tmp_path, monkeypatch):
@@ -171,6 +231,8 @@ def test_what_the_poses_are_comes_first(bag, truth):
         (["/truth"], {"sub_trajectory": -1.0}, "give metres, more than 0"),
         (["/truth"], {"sub_trajectory": 50.0}, "no 50 m of it can be judged"),
         (["/truth"], {"extrinsic": [1.0, 2.0]}, "extrinsic: give numbers"),
+        (["/truth"], {"extrinsic": "0, 0, 0, 1"}, "extrinsic: give numbers"),
+        (["/truth"], {"reference": "none"}, "reference none: errors are measured by a reference"),
         (
             ["/truth"],
             {"clock_offset": 1e6},

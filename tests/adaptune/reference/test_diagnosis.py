@@ -390,12 +390,3 @@ def test_what_a_trajectory_is_and_the_option_that_mends_it(make, words):
     found = diagnose_trajectory(made, Trajectory(SCANS, T), made.stamps[:-4], 100_000_000)
     assert (found is None) == (words is None), found
     assert words is None or words in str(found)
-
-
-def test_a_reference_that_contradicts_its_scans_is_told(monkeypatch):
-    monkeypatch.setattr(diagnosis, "measured_motions", lambda scans, _: [*scans] and hops())
-    scans = Recorded(poses(SCANS))
-    scans.n_messages = len(SCANS)
-    assert diagnosis.contradiction(scans, Trajectory(POSES, poses(POSES))) is None
-    found = diagnosis.contradiction(scans, Trajectory(POSES, turned(poses(POSES))))
-    assert "other axes" in found.what
