@@ -66,6 +66,7 @@ def test_the_command_watches_along_a_bag(bag):
         (["a.bag", "--odometry", "/odom", "--ros2"], "name a bag, or listen on a robot"),
         (["a.bag", "--odometry", "/nobody"], "/nobody"),
         (["--ros2", "--odometry", "/odom"], "--points: name the topic"),
+        (["--ros2", "--points", "/p", "--odometry", "my odom"], "--odometry my odom: "),
     ],
 )
 def test_what_is_wrong_is_told(bag, words, says):  # noqa: ARG001
