@@ -31,7 +31,7 @@ from online.watch import Told, Watch
 
 RECORDINGS = ("town", "street", "road", "city", "hall")
 SCENES = ("street", "mine", "open", "garden")
-LENGTH, BEFORE, AFTER = 10.0, 12.0, 6.0
+LENGTH, BEFORE, AFTER = 25.0, 12.0, 6.0
 WRONG = 0.2, 3.0
 """Metres, and degrees, of a second from which an odometry is rightly doubted."""
 SOON, NEAR = 2.0, 5.0

@@ -51,7 +51,7 @@ class Watch:
     motion.
     """
 
-    def __init__(self, length: float = 10.0, health: HealthCheck | None = None):
+    def __init__(self, length: float = 25.0, health: HealthCheck | None = None):
         self._evidence = LiveEvidence((), length, WINDOW)
         self._guard = Guard(health or HealthCheck())
         self._periods, self._starts = Periods(1e9), 0

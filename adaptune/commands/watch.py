@@ -35,7 +35,7 @@ def watch(
     bag: Bag = None,
     points: Points = None,
     extrinsic: Place = None,
-    sub_trajectory: Length = 10.0,
+    sub_trajectory: Length = 25.0,
     out: Table = Path("watch.csv"),
     ros: Ros = False,
     ros2: Ros2 = False,
