@@ -1,0 +1,129 @@
+"""A portfolio: a few parameter sets of an odometry, of which one does well in nearly each place."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field
+
+from adaptune import manifest
+from adaptune.errors import AdaptuneError, Finding, nearest
+from adaptune.recording.scan import Scan
+from adaptune.space import ParameterSet, ParameterSpace, Value
+from adaptune.strict import StrictModel, validated
+from adaptune.yaml12 import Document
+
+FOLDER = Path(__file__).parent / "portfolios"
+"""Those that adaptune brings, a file for each odometry."""
+SECTOR = 10
+"""Degrees of a sector in which a sensor sees something, or nothing."""
+FAR = 1.5
+"""By so large a factor, scans are beyond those that a portfolio was chosen on."""
+
+
+class PortfolioError(AdaptuneError):
+    """A portfolio that cannot be used."""
+
+
+class ScanKind(NamedTuple):
+    """What tells one kind of sensor from another."""
+
+    rate: float  # scans a second
+    points: int  # of a scan
+    view: int  # degrees, seen from above
+
+    @classmethod
+    def of(cls, scan: Scan, rate: float) -> Self:
+        """The kind of a scan."""
+        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        return cls(rate, len(scan), SECTOR * len(np.unique(azimuth // SECTOR % (360 // SECTOR))))
+
+
+_WORDS = {"rate": "scans a second", "points": "points a scan", "view": "degrees of view"}
+
+
+class Member(StrictModel):
+    """A parameter set of a portfolio, and what it is good for."""
+
+    parameters: dict[str, Value] = Field(min_length=1)
+    good_for: str = ""
+
+
+class Portfolio(StrictModel):
+    """What a file says; ``docs/portfolios.md`` describes every key."""
+
+    odometry: str
+    sets: tuple[Member, ...] = Field(min_length=2)  # the first is the baseline
+    made: str = ""  # on this day
+    version: str = ""  # by this adaptune
+    tables: str = ""  # digest of the tables that it was chosen by
+    courses: tuple[str, ...] = ()
+    recordings: tuple[str, ...] = ()
+    # The least and the most of what it was chosen on.
+    scans: dict[Literal["rate", "points", "view"], tuple[float, float]] = Field(
+        default_factory=dict
+    )
+    # By course and recording, the errors of the sets in times the baseline's.
+    ratios: dict[str, tuple[float, ...]] = Field(default_factory=dict)
+
+    @property
+    def digest(self) -> str:
+        """Tells it from others."""
+        return manifest.digest(self.model_dump(mode="json"))[:12]
+
+    def unlike(self, kind: ScanKind) -> str:
+        """How scans differ from all that it was chosen on, in words; empty if they do not."""
+        found = []
+        for name, (low, high) in self.scans.items():
+            if not low / FAR <= (value := getattr(kind, name)) <= high * FAR:
+                found.append(f"{value:,.3g} {_WORDS[name]} (it was chosen on {low:g} to {high:g})")
+        return " and ".join(found)
+
+    def fitting(
+        self, space: ParameterSpace, known: Collection[str]
+    ) -> tuple[list[ParameterSet], list[str]]:
+        """The sets but the baseline as sets of a space, and what must be said of them.
+
+        `known` are the names of all parameters of the odometry, tuned or not; there is a
+        PortfolioError if it has no such parameter.
+        """
+        base, sets, left_out = self.sets[0].parameters, list[ParameterSet](), list[str]()
+        for i, one in enumerate(self.sets):
+            for name in one.parameters:
+                if name not in known:
+                    what = f"{self.odometry} has no parameter {name!r}: {nearest(name, known)}"
+                    raise PortfolioError(f"sets.{i}.parameters.{name}: {what}")
+            own = space.complete({k: v for k, v in one.parameters.items() if k in space.names})
+            wrong = [k for k, p in space.parameters.items() if not p.contains(own[k])]
+            wrong += [
+                k for k, v in one.parameters.items() if k not in space.names and v != base.get(k)
+            ]
+            if wrong:
+                left_out.append(f"set {i} ({', '.join(wrong)})")
+            elif i and own != space.baseline and own not in sets:
+                sets.append(own)
+        said = []
+        if left_out:
+            what = "they are outside of the ranges, or move what is not tuned"
+            said.append(f"left out: {'; '.join(left_out)}, because {what}")
+        if other := [k for k, v in space.baseline.items() if base.get(k, v) != v]:
+            said.append(f"was chosen with another baseline ({', '.join(other)})")
+        return sets, said
+
+
+def path_of(name: str) -> Path:
+    """The file of a portfolio: that of an odometry which adaptune brings, or a user's by its name."""
+    given = Path(name)
+    return given if given.suffix in (".yaml", ".yml") else FOLDER / f"{name}.yaml"
+
+
+def read_portfolio(name: str) -> Portfolio:
+    """Read a portfolio; an AdaptuneError names the file, the line and the key of each mistake."""
+    document, mistakes = Document.of_file(path := path_of(name)), list[Finding]()
+    data: Any = document.data
+    found = validated(Portfolio, data, (), mistakes)
+    if found is None:
+        said = (f"{document.where(path, one.where)}: {one}" for one in mistakes)
+        raise PortfolioError("\n".join(said))
+    return found

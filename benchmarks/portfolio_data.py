@@ -1,0 +1,233 @@
+"""What parameter sets do on the courses of a design and on recordings, for `portfolio.py`."""
+
+import csv
+import sys
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, product
+from pathlib import Path
+
+import numpy as np
+from gain_data import DEFAULTS, NO_SEQUENCES, Simulated
+from numpy.typing import NDArray
+from recorded import RECORDINGS, driven
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
+
+from made_drives import trials_of
+
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
+from adaptune.files import replacing
+from adaptune.geometry import invert
+from adaptune.metrics import travelled
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.portfolio import ScanKind
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.remote import Limits
+from adaptune.recording.compensation import compensate, compensate_neighbours
+from adaptune.recording.scan import Scan
+from adaptune.simulation import Course
+from adaptune.simulation.course import MOTIONS
+from adaptune.simulation.record import SimulatedDrive, SimulatedScan
+from adaptune.space import ParameterSet
+from offline.choice import PER_BLOCK
+from offline.config import OfflineConfig, load_study
+from offline.drive import TrialSetup
+from offline.labelled import block_means
+from offline.samplers import make_sampler
+
+SCENES = ("cave", "street", "open", "garden", "corridor", "mine")
+SENSORS = ("vlp16", "hdl32e", "hdl64e", "narrow")
+GROUPS = ("robot", "agile", "car")
+STRIDES = {"robot": (1, 2, 5, 10), "agile": (1, 2, 5, 10), "car": (1, 1, 2, 3)}
+"""Of the 10 scans a second, every so manieth is kept: a robot is as fast as 3 m/s, a car 10."""
+NARROW = 70.0
+"""Degrees that a narrow view spans, ahead."""
+COLUMNS = {"hdl64e": 1024, "os0-64": 1024}
+OF_RECORDINGS = {
+    **dict.fromkeys(("town", "road", "city", "street"), "hdl64e"),
+    **{"campus": "hdl32e", "hall": "wide", "livox_hku_1": "narrow", "livox_hku_2": "narrow"},
+}
+"""Recordings that are long enough, and their sensors."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A course or a recording, and how the sets did there."""
+
+    name: str
+    sensor: str
+    kind: ScanKind
+    recorded: bool
+    begin: NDArray[np.float64]  # (n_blocks,): where each block begins, as a share of the scans
+    errors: NDArray[np.float64]  # (n_blocks, n_sets): mean capped error in percent
+    costs: NDArray[np.float64]  # (n_sets,): ms of CPU time a scan
+    restarts: NDArray[np.float64]  # (n_sets,): infinite for a set that failed
+
+
+def design(seed: int = 0) -> dict[str, tuple[str, Course]]:
+    """Sensors and courses by name: each scene with each sensor, and once with each stride.
+
+    One is like a hall at two scans a second, in hard turns.
+    """
+    courses = {}
+    for i, (scene, sensor) in enumerate(product(SCENES, SENSORS)):
+        a, b = divmod(i, len(SENSORS))
+        motion = GROUPS[(a // 2 + b) % len(GROUPS)]
+        stride, carries = STRIDES[motion][(a + b) % 4], "hdl64e" if sensor == "narrow" else sensor
+        if (scene, sensor) == ("corridor", "hdl64e"):
+            sensor, carries, motion, stride = "wide", "os0-64", "agile", 5
+        course = Course(
+            scenes=(scene,),
+            length=1000.0,
+            sensor=carries,
+            motion=motion,
+            seed=100 * seed + i,
+            stride=stride,
+            columns=None if sensor == "narrow" else COLUMNS.get(carries),
+        )
+        courses[f"{scene}-{sensor}"] = sensor, course
+    return courses
+
+
+def sets_of(odometry: str, n: int, seed: int) -> list[ParameterSet]:
+    """The baseline and the sets that a search begins with."""
+    sampler = make_sampler(odometry_class(odometry).space, OfflineConfig(initial=n, seed=seed))
+    history: list[tuple[ParameterSet, float]] = []
+    while len(history) < n and (found := sampler.propose(history)) is not None:
+        history.append((found.parameters, 0.0))
+    return [parameters for parameters, _ in history]
+
+
+def scans_of(sensor: str, course: Course, n: int) -> Iterator[SimulatedScan]:
+    """The first scans of a course: without the motion within them, of a narrow view cropped."""
+    drive = SimulatedDrive(course)
+    scans: Iterator[Scan] = islice(drive.scans(), n)
+    if course.stride == 1:
+        scans = compensate_neighbours(scans)
+    for scan in scans:
+        assert isinstance(scan, SimulatedScan)
+        if course.stride > 1:  # as keyframes are recorded
+            start = drive.seconds(np.array([scan.stamp]))
+            (T_world_end,) = drive.ride.poses(start + 1.0 / course.turns)
+            moved = invert(scan.T_world_sensor) @ T_world_end
+            scan = compensate(scan, moved, 1.0 / course.turns)  # noqa: PLW2901
+        if sensor == "narrow":
+            azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+            seen = scan.select(np.abs(azimuth) <= NARROW / 2.0)
+            scan = replace(scan, points=seen.points, times=seen.times, rings=None, intensities=None)  # noqa: PLW2901
+        yield scan
+
+
+def drive_course(name: str, odometry: str, n_sets: int, n_scans: int, seed: int) -> Place:
+    """Drive all sets along a course."""
+    sensor, course = design(seed)[name]
+    scans = list(scans_of(sensor, course, n_scans))
+    n, stamps = len(scans), np.array([scan.stamp for scan in scans])
+    T_ref_sensor = np.array([scan.T_world_sensor for scan in scans])
+    few, elevation = np.zeros((n, 1), np.float32), np.zeros(n, np.float32)
+    frames = Frames(stamps, T_ref_sensor, few, {"none": 1}, elevation)
+    speed, spacing = MOTIONS[course.motion].speed, travelled(T_ref_sensor)[-1] / n
+    length = 10.0 if speed > 5.0 or spacing > 1.0 else 5.0
+    changed = {"sub_trajectory": length, "health": HealthCheck(max_speed=2.0 * speed)}
+    factory = OdometryFactory(odometry, {}, odometry_class(odometry).space, Limits())
+    setup = TrialSetup(DEFAULTS.model_copy(update=changed), factory, NO_SEQUENCES)
+    sets = sets_of(odometry, n_sets, 0)
+    trials = trials_of(setup, sets, name, frames, Simulated(name, scans), memory=0)
+    errors = np.stack([trial.errors for trial in trials], axis=1)
+    known = np.flatnonzero(~np.isnan(errors).any(axis=1))
+    metres = travelled(T_ref_sensor)[known]
+    n_blocks = max(1, round((metres[-1] - metres[0]) / (PER_BLOCK * length)))
+    block = np.minimum((metres - metres[0]) / (PER_BLOCK * length), n_blocks - 1).astype(int)
+    first = np.unique(block, return_index=True)[1]
+    return Place(
+        name,
+        sensor,
+        ScanKind.of(scans[n // 2], 1e9 * (n - 1) / float(stamps[-1] - stamps[0])),
+        False,
+        known[first] / n,
+        block_means(errors[known], block),
+        np.array([trial.usage[REGISTER_MS] + trial.usage[PREPARE_MS] for trial in trials]),
+        np.array([np.inf if t.failure else float(t.restarted.sum()) for t in trials]),
+    )
+
+
+def drive_recording(name: str, odometry: str, n_sets: int, folder: Path) -> Place:
+    """Drive all sets along a recording."""
+    given = Namespace(folder=folder, sets=n_sets, seed=0, no_reference=False)
+    data = driven(given, name, odometry)
+    (one,) = data.sequences
+    study = load_study(folder / f"{name}.yaml", folder=folder / name)
+    n, stamps = len(one.simulation.stamps), one.simulation.stamps
+    scan = next(islice(study.sequences.open(name), n // 2, None))
+    first = np.unique(one.block, return_index=True)[1]
+    return Place(
+        name,
+        OF_RECORDINGS[name],
+        ScanKind.of(scan, 1e9 / float(np.median(np.diff(stamps)))),
+        True,
+        one.known[first] / n,
+        one.in_blocks(),
+        data.blocks().costs,
+        data.blocks().restarts,
+    )
+
+
+COLUMNS_OF_PLACES = ("place", "sensor", "recorded", "rate", "points", "view", "what", "begin")
+
+
+def write_places(path: Path, places: Sequence[Place]) -> None:
+    """Write places as a table: a row for each block, for costs and for restarts."""
+    rows = []
+    for place in places:
+        kind = place.kind
+        about = [place.name, place.sensor, int(place.recorded)]
+        about += [f"{kind.rate:.3g}", kind.points, kind.view]
+        for begin, errors in zip(place.begin, place.errors, strict=True):
+            rows.append([*about, "error", f"{begin:.3f}", *(f"{x:.4g}" for x in errors)])
+        rows.append([*about, "cost", "", *(f"{x:.3g}" for x in place.costs)])
+        rows.append([*about, "restarts", "", *(f"{x:g}" for x in place.restarts)])
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        n_sets = len(places[0].costs)
+        csv.writer(file).writerows([[*COLUMNS_OF_PLACES, *range(n_sets)], *rows])
+
+
+def read_places(path: Path) -> list[Place]:
+    """Read what `write_places` wrote."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    places = []
+    for name in dict.fromkeys(row["place"] for row in rows):
+        mine = [row for row in rows if row["place"] == name]
+        numbers = [key for key in mine[0] if key.isdigit()]
+
+        def values(
+            what: str, of: Sequence[dict[str, str]] = mine, keys: Sequence[str] = numbers
+        ) -> NDArray[np.float64]:
+            return np.array([[float(r[k]) for k in keys] for r in of if r["what"] == what])
+
+        one = mine[0]
+        kind = ScanKind(float(one["rate"]), int(one["points"]), int(one["view"]))
+        begin = np.array([float(row["begin"]) for row in mine if row["what"] == "error"])
+        of = (begin, values("error"), values("cost")[0], values("restarts")[0])
+        places.append(Place(name, one["sensor"], kind, one["recorded"] == "1", *of))
+    return places
+
+
+def driven_places(given: Namespace, folder: Path) -> list[Place]:
+    """All places that were asked for; what is not in the folder yet is driven."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for name in [*given.recordings, *list(design(given.seed))[: given.courses]]:
+        if not (path := folder / f"{name}.csv").exists():
+            if name in RECORDINGS:
+                place = drive_recording(name, given.odometry, given.sets, folder / "recordings")
+            else:
+                place = drive_course(name, given.odometry, given.sets, given.scans, given.seed)
+            write_places(path, [place])
+            means = np.exp(np.log(place.errors + 1e-6).mean(axis=0))
+            print(f"{name}: baseline {means[0]:.3g} %, best {means.min():.3g} %", flush=True)
+        found += read_places(path)
+    return found
