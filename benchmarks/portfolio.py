@@ -130,8 +130,9 @@ def left_out(
     place: Place, places: Sequence[Place], sensor: bool, choose_sets: Callable[..., list[int]]
 ) -> list[int]:
     """A portfolio that is chosen without a place, or without its sensor."""
-    others = [p for p in places if p.name != place.name and not (sensor and p.sensor == place.sensor)]
-    return choose_sets(others)
+    return choose_sets(
+        [p for p in places if (p.sensor != place.sensor if sensor else p.name != place.name)]
+    )
 
 
 def line(what: str, found: Sequence[tuple[float, float]], base: Sequence[float] = ()) -> str:

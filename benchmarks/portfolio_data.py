@@ -48,7 +48,9 @@ NARROW = 70.0
 COLUMNS = {"hdl64e": 1024, "os0-64": 1024}
 OF_RECORDINGS = {
     **dict.fromkeys(("town", "road", "city", "street"), "hdl64e"),
-    **{"campus": "hdl32e", "hall": "wide", "livox_hku_1": "narrow", "livox_hku_2": "narrow"},
+    **dict.fromkeys(("livox_hku_1", "livox_hku_2"), "narrow"),
+    "campus": "hdl32e",
+    "hall": "wide",
 }
 """Recordings that are long enough, and their sensors."""
 
@@ -76,9 +78,10 @@ def design(seed: int = 0) -> dict[str, tuple[str, Course]]:
     for i, (scene, sensor) in enumerate(product(SCENES, SENSORS)):
         a, b = divmod(i, len(SENSORS))
         motion = GROUPS[(a // 2 + b) % len(GROUPS)]
-        stride, carries = STRIDES[motion][(a + b) % 4], "hdl64e" if sensor == "narrow" else sensor
+        stride, called = STRIDES[motion][(a + b) % 4], sensor
+        carries = "hdl64e" if sensor == "narrow" else sensor
         if (scene, sensor) == ("corridor", "hdl64e"):
-            sensor, carries, motion, stride = "wide", "os0-64", "agile", 5
+            called, carries, motion, stride = "wide", "os0-64", "agile", 5
         course = Course(
             scenes=(scene,),
             length=1000.0,
@@ -88,7 +91,7 @@ def design(seed: int = 0) -> dict[str, tuple[str, Course]]:
             stride=stride,
             columns=None if sensor == "narrow" else COLUMNS.get(carries),
         )
-        courses[f"{scene}-{sensor}"] = sensor, course
+        courses[f"{scene}-{called}"] = called, course
     return courses
 
 

@@ -61,6 +61,7 @@ def inspect(
     check_no_study(file)
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
+    from adaptune.odometry.portfolio import portfolios_of
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
     from adaptune.tuning.studies import ROLES, proposed, roles
@@ -81,6 +82,7 @@ def inspect(
         )
         return
     rest = roles([found.name], length, {"name": "gicp"}, share)
+    rest |= {"offline": {"portfolio": of}} if (of := portfolios_of(["gicp"])) else {}
     say(dump(rest, ROLES))
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "
@@ -210,6 +212,16 @@ Budget = Annotated[
 ]
 
 
+Portfolio = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE",
+        help="Parameter sets to try first, see docs/portfolios.md; or none.",
+        show_default="the odometry's, if it has one",
+    ),
+]
+
+
 Bags = Annotated[
     list[Path],
     typer.Argument(
@@ -252,6 +264,7 @@ def tune(
     trials: Trials = None,
     minutes: Minutes = None,
     budget: Budget = None,
+    portfolio: Portfolio = None,
     override: Override = [],  # noqa: B006
     folder: Kept = None,
     cluster: Cluster = None,
@@ -271,7 +284,7 @@ def tune(
     from adaptune.tuning.tuned import tune_asked
 
     odometry = odometry or ("gicp" if config is None else "kiss_icp")
-    limits = (trials, minutes, budget)
+    limits = (trials, minutes, budget, portfolio)
     asked = Asked(recordings, odometry, points, reference, config, test, reading, {}, *limits)
     with progress() as show:
         if (path := proposed_system(asked, folder, show)) is None:

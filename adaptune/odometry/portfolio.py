@@ -1,6 +1,6 @@
 """A portfolio: a few parameter sets of an odometry, of which one does well in nearly each place."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -16,6 +16,7 @@ from adaptune.yaml12 import Document
 
 FOLDER = Path(__file__).parent / "portfolios"
 """Those that adaptune brings, a file for each odometry."""
+NO_PORTFOLIO = "none"
 SECTOR = 10
 """Degrees of a sector in which a sensor sees something, or nothing."""
 FAR = 1.5
@@ -113,9 +114,9 @@ class Portfolio(StrictModel):
 
 
 def path_of(name: str) -> Path:
-    """The file of a portfolio: that of an odometry which adaptune brings, or a user's by its name."""
+    """The file of a portfolio: the one that adaptune brings of an odometry, or a user's."""
     given = Path(name)
-    return given if given.suffix in (".yaml", ".yml") else FOLDER / f"{name}.yaml"
+    return given if given.is_absolute() or given.suffix else FOLDER / f"{name}.yaml"
 
 
 def read_portfolio(name: str) -> Portfolio:
@@ -127,3 +128,16 @@ def read_portfolio(name: str) -> Portfolio:
         said = (f"{document.where(path, one.where)}: {one}" for one in mistakes)
         raise PortfolioError("\n".join(said))
     return found
+
+
+def portfolios_of(odometries: Iterable[str], given: str | None = None) -> dict[str, str]:
+    """The portfolios of some odometries, as a study names them: those that adaptune brings.
+
+    One that is `given`, a file, takes the place of its odometry's; `none` stands for none.
+    """
+    if given == NO_PORTFOLIO:
+        return {}
+    there = {name: name for name in odometries if (FOLDER / f"{name}.yaml").exists()}
+    if given is not None:
+        there[read_portfolio(given).odometry] = given
+    return {name: read_portfolio(name).digest for name in there.values()}

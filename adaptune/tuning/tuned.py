@@ -178,6 +178,7 @@ def tune(
     trials: int | None = None,
     minutes: float | None = None,
     budget: float | str | None = None,
+    portfolio: str | Path | None = None,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     cluster: str | None = None,
@@ -205,6 +206,8 @@ def tune(
     trials, minutes, budget
         Parameter sets to try, time for all of it, and the CPU time a scan that may be spent:
         milliseconds, or ``"3x"``, times what the baseline takes; by default twice as much.
+    portfolio
+        A file of sets that are tried first, or ``"none"``; by default the odometry's.
     overrides, folder
         Values of the study, as in ``["offline.seed=1"]``, and where all results go.
     cluster
@@ -220,6 +223,7 @@ def tune(
     file = None if config is None else Path(config)
     tested, limits = _paths(test), (trials, minutes, budget)
     asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
+    asked = asked._replace(portfolio=None if portfolio is None else str(portfolio))
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
         # It stays where it is if the working folder changes.
@@ -235,6 +239,7 @@ def tune_asked(
     show: Progress,
 ) -> Tuned:
     """Do what `tune` does of what was asked."""
+    from adaptune.odometry.portfolio import NO_PORTFOLIO
     from adaptune.odometry.registry import forget_user_code
     from offline.config import load_study
     from offline.search import ELAPSED, Stopwatch
@@ -245,6 +250,8 @@ def tune_asked(
     forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
+    if asked.portfolio not in (None, NO_PORTFOLIO):
+        asked = asked._replace(portfolio=str(Path(asked.portfolio).resolve()))
     folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)
     path, now, more = written(asked, overrides, folder, show)
