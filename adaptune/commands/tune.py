@@ -87,8 +87,7 @@ def inspect(
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "
     if study is not None:
-        data = {"sequences": {found.name: found.given}} | rest
-        write_text(study, dump(data, found.hints | ROLES))
+        write_text(study, dump({"sequences": {found.name: found.given}} | rest, found.hints | ROLES))
     if found.reference is None and study is None:
         say_next("find where it moves, train on a part of it and compare", "tune", file)
     else:

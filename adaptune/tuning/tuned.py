@@ -206,10 +206,9 @@ def tune(
     trials, minutes, budget
         Parameter sets to try, time for all of it, and the CPU time a scan that may be spent:
         milliseconds, or ``"3x"``, times what the baseline takes; by default twice as much.
-    portfolio
-        A file of sets that are tried first, or ``"none"``; by default the odometry's.
-    overrides, folder
-        Values of the study, as in ``["offline.seed=1"]``, and where all results go.
+    overrides, folder, portfolio
+        Values of the study, as in ``["offline.seed=1"]``, where all results go, and a file of sets
+        to try first, by default the odometry's.
     cluster
         Address of a Dask scheduler whose workers run the trials.
     progress
@@ -219,11 +218,11 @@ def tune(
         raise AdaptuneError(f"reading: give 'one' or 'several', not {reading!r}")
     overrides = [overrides] if isinstance(overrides, str) else overrides
     name, about = named_odometry(odometry or ("gicp" if config is None else "kiss_icp"))
-    judged = None if reference is None else str(reference)
+    judged, first = (None if one is None else str(one) for one in (reference, portfolio))
     file = None if config is None else Path(config)
     tested, limits = _paths(test), (trials, minutes, budget)
-    asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
-    asked = asked._replace(portfolio=None if portfolio is None else str(portfolio))
+    of = (_paths(recordings), name, points, judged, file, tested, reading, about)
+    asked = Asked(*of, *limits, first)
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
         # It stays where it is if the working folder changes.

@@ -58,7 +58,7 @@ def test_of_several_odometries_each_has_its_sets_in_turn(study_file, tmp_path, p
         study.odometry.space.check(one)
 
 
-def test_mistakes_name_the_file_and_the_key(study_file, portfolio, tmp_path):
+def test_mistakes_name_the_file_and_the_key(study_file, portfolio):
     path, given = portfolio("gicp")
     said = failure(study_file, f"offline.portfolio={{{given}}}")
     assert f"offline.portfolio: {path}: odometry: is of gicp, and tuned is " in said
