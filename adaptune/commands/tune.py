@@ -61,10 +61,9 @@ def inspect(
     check_no_study(file)
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
-    from adaptune.odometry.portfolio import portfolios_of
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
-    from adaptune.tuning.studies import ROLES, proposed, roles
+    from adaptune.tuning.studies import ROLES, begin_of_search, proposed, roles
     from adaptune.yaml12 import dump
 
     if _show_several(file, reading):
@@ -81,13 +80,13 @@ def inspect(
             "serve, write `reference: estimated`"
         )
         return
-    rest = roles([found.name], length, {"name": "gicp"}, share)
-    rest |= {"offline": {"portfolio": of}} if (of := portfolios_of(["gicp"])) else {}
+    rest = roles([found.name], length, {"name": "gicp"}, share) | begin_of_search(["gicp"])
     say(dump(rest, ROLES))
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "
     if study is not None:
-        write_text(study, dump({"sequences": {found.name: found.given}} | rest, found.hints | ROLES))
+        data = {"sequences": {found.name: found.given}} | rest
+        write_text(study, dump(data, found.hints | ROLES))
     if found.reference is None and study is None:
         say_next("find where it moves, train on a part of it and compare", "tune", file)
     else:
