@@ -207,8 +207,7 @@ def tune(
         Parameter sets to try, time for all of it, and the CPU time a scan that may be spent:
         milliseconds, or ``"3x"``, times what the baseline takes; by default twice as much.
     overrides, folder, portfolio
-        Values of the study, as in ``["offline.seed=1"]``, where all results go, and a file of sets
-        to try first, by default the odometry's.
+        Of the study, as in ``["offline.seed=1"]``; where results go; sets to try first (a file).
     cluster
         Address of a Dask scheduler whose workers run the trials.
     progress
@@ -220,9 +219,8 @@ def tune(
     name, about = named_odometry(odometry or ("gicp" if config is None else "kiss_icp"))
     judged, first = (None if one is None else str(one) for one in (reference, portfolio))
     file = None if config is None else Path(config)
-    tested, limits = _paths(test), (trials, minutes, budget)
-    of = (_paths(recordings), name, points, judged, file, tested, reading, about)
-    asked = Asked(*of, *limits, first)
+    tested, limits = _paths(test), (trials, minutes, budget, first)
+    asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
         # It stays where it is if the working folder changes.
