@@ -43,6 +43,8 @@ SENSORS = ("vlp16", "hdl32e", "hdl64e", "narrow")
 GROUPS = ("robot", "agile", "car")
 STRIDES = {"robot": (1, 2, 5, 10), "agile": (1, 2, 5, 10), "car": (1, 1, 2, 3)}
 """Of the 10 scans a second, every so manieth is kept: a robot is as fast as 3 m/s, a car 10."""
+STEP = 5
+"""From course to course of the product of all, so that the first ones are of many kinds."""
 NARROW = 70.0
 """Degrees that a narrow view spans, ahead."""
 COLUMNS = {"hdl64e": 1024, "os0-64": 1024}
@@ -74,8 +76,8 @@ def design(seed: int = 0) -> dict[str, tuple[str, Course]]:
 
     One is like a hall at two scans a second, in hard turns.
     """
-    courses = {}
-    for i, (scene, sensor) in enumerate(product(SCENES, SENSORS)):
+    courses, pairs = {}, list(enumerate(product(SCENES, SENSORS)))
+    for i, (scene, sensor) in sorted(pairs, key=lambda pair: STEP * pair[0] % len(pairs)):
         a, b = divmod(i, len(SENSORS))
         motion = GROUPS[(a // 2 + b) % len(GROUPS)]
         stride, called = STRIDES[motion][(a + b) % 4], sensor

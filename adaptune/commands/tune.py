@@ -212,11 +212,7 @@ Budget = Annotated[
 
 Portfolio = Annotated[
     str | None,
-    typer.Option(
-        metavar="FILE",
-        help="Parameter sets to try first, see docs/portfolios.md; or none.",
-        show_default="the odometry's, if it has one",
-    ),
+    typer.Option(metavar="FILE", help="Parameter sets to try first, in place of ours; or none."),
 ]
 
 

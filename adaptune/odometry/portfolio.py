@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -16,7 +16,6 @@ from adaptune.yaml12 import Document
 
 FOLDER = Path(__file__).parent / "portfolios"
 """Those that adaptune brings, a file for each odometry."""
-NO_PORTFOLIO = "none"
 SECTOR = 10
 """Degrees of a sector in which a sensor sees something, or nothing."""
 FAR = 1.5
@@ -41,7 +40,7 @@ class ScanKind(NamedTuple):
         return cls(rate, len(scan), SECTOR * len(np.unique(azimuth // SECTOR % (360 // SECTOR))))
 
 
-_WORDS = {"rate": "scans a second", "points": "points a scan", "view": "degrees of view"}
+_Axis = Literal["rate", "points", "view"]
 
 
 class Member(StrictModel):
@@ -61,10 +60,8 @@ class Portfolio(StrictModel):
     tables: str = ""  # digest of the tables that it was chosen by
     courses: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()
-    # The least and the most of what it was chosen on.
-    scans: dict[Literal["rate", "points", "view"], tuple[float, float]] = Field(
-        default_factory=dict
-    )
+    # The least and the most of what it was chosen on, see `ScanKind`.
+    scans: dict[_Axis, tuple[float, float]] = Field(default_factory=dict)
     # By course and recording, the errors of the sets in times the baseline's.
     ratios: dict[str, tuple[float, ...]] = Field(default_factory=dict)
 
@@ -75,11 +72,12 @@ class Portfolio(StrictModel):
 
     def unlike(self, kind: ScanKind) -> str:
         """How scans differ from all that it was chosen on, in words; empty if they do not."""
-        found = []
-        for name, (low, high) in self.scans.items():
-            if not low / FAR <= (value := getattr(kind, name)) <= high * FAR:
-                found.append(f"{value:,.3g} {_WORDS[name]} (it was chosen on {low:g} to {high:g})")
-        return " and ".join(found)
+        known = ((name, getattr(kind, name), *ends) for name, ends in self.scans.items())
+        return ", ".join(
+            f"{name} {value:g} (it was chosen on {low:g} to {high:g})"
+            for name, value, low, high in known
+            if not low / FAR <= value <= high * FAR
+        )
 
     def fitting(
         self, space: ParameterSpace, known: Collection[str]
@@ -97,17 +95,14 @@ class Portfolio(StrictModel):
                     raise PortfolioError(f"sets.{i}.parameters.{name}: {what}")
             own = space.complete({k: v for k, v in one.parameters.items() if k in space.names})
             wrong = [k for k, p in space.parameters.items() if not p.contains(own[k])]
-            wrong += [
-                k for k, v in one.parameters.items() if k not in space.names and v != base.get(k)
-            ]
-            if wrong:
+            untuned = [k for k in one.parameters if k not in own]
+            wrong += [k for k in untuned if one.parameters[k] != base.get(k)]
+            if i and wrong:
                 left_out.append(f"set {i} ({', '.join(wrong)})")
             elif i and own != space.baseline and own not in sets:
                 sets.append(own)
-        said = []
-        if left_out:
-            what = "they are outside of the ranges, or move what is not tuned"
-            said.append(f"left out: {'; '.join(left_out)}, because {what}")
+        why = "because they are outside of the ranges, or move what is not tuned"
+        said = [f"left out: {'; '.join(left_out)}, {why}"] if left_out else []
         if other := [k for k, v in space.baseline.items() if base.get(k, v) != v]:
             said.append(f"was chosen with another baseline ({', '.join(other)})")
         return sets, said
@@ -122,9 +117,7 @@ def path_of(name: str) -> Path:
 def read_portfolio(name: str) -> Portfolio:
     """Read a portfolio; an AdaptuneError names the file, the line and the key of each mistake."""
     document, mistakes = Document.of_file(path := path_of(name)), list[Finding]()
-    data: Any = document.data
-    found = validated(Portfolio, data, (), mistakes)
-    if found is None:
+    if (found := validated(Portfolio, document.data, (), mistakes)) is None:
         said = (f"{document.where(path, one.where)}: {one}" for one in mistakes)
         raise PortfolioError("\n".join(said))
     return found
@@ -135,7 +128,7 @@ def portfolios_of(odometries: Iterable[str], given: str | None = None) -> dict[s
 
     One that is `given`, a file, takes the place of its odometry's; `none` stands for none.
     """
-    if given == NO_PORTFOLIO:
+    if given == "none":
         return {}
     there = {name: name for name in odometries if (FOLDER / f"{name}.yaml").exists()}
     if given is not None:

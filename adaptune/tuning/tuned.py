@@ -236,7 +236,6 @@ def tune_asked(
     show: Progress,
 ) -> Tuned:
     """Do what `tune` does of what was asked."""
-    from adaptune.odometry.portfolio import NO_PORTFOLIO
     from adaptune.odometry.registry import forget_user_code
     from offline.config import load_study
     from offline.search import ELAPSED, Stopwatch
@@ -247,7 +246,7 @@ def tune_asked(
     forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
-    if asked.portfolio not in (None, NO_PORTFOLIO):
+    if asked.portfolio not in (None, "none"):
         asked = asked._replace(portfolio=str(Path(asked.portfolio).resolve()))
     folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)

@@ -483,7 +483,7 @@ def test_a_study_keeps_the_portfolio_that_it_began_with(bag, tmp_path, caplog):
     (tmp_path / "mine.yaml").write_text(PORTFOLIO)
     failed(bag, *FAKE, "--portfolio", "mine.yaml", "--folder", "out")
     what = "its scans are unlike those that the portfolio of fake_odometry:Fake was chosen on"
-    assert f"one: {what}: 10 scans a second (it was chosen on 1 to 2)" in caplog.text
+    assert f"one: {what}: rate 10 (it was chosen on 1 to 2)" in caplog.text
     study = study_in("out/out.yaml")
     assert list(study.config.offline.portfolio) == [str(tmp_path / "mine.yaml")]
     assert [one["max_correspondence_distance"] for one in study.portfolio] == [1.0]

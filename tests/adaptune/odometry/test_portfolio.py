@@ -91,8 +91,7 @@ def test_scans_unlike_those_that_it_was_chosen_on_are_told():
     portfolio = Portfolio.model_validate(made({"passes": 3}, scans=scans))
     assert portfolio.unlike(ScanKind(10.0, 30_000, 360)) == ""
     assert portfolio.unlike(ScanKind(1.0, 30_000, 70)) == (
-        "1 scans a second (it was chosen on 2 to 10) and 70 degrees of view (it was chosen on 360 "
-        "to 360)"
+        "rate 1 (it was chosen on 2 to 10), view 70 (it was chosen on 360 to 360)"
     )
     azimuth = np.radians(np.arange(-34.5, 35.0))
     points = np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
