@@ -1,7 +1,7 @@
 """Choose a portfolio of parameter sets of an odometry, and say how good it is.
 
-    python benchmarks/portfolio.py FOLDER [--odometry gicp] [--sets 40] [--courses 24]
-                                          [--scans 120] [--recordings hall town ...]
+    python benchmarks/portfolio.py FOLDER [--odometry gicp] [--sets 23] [--courses 24]
+                                          [--scans 80] [--recordings hall town ...]
     python benchmarks/portfolio.py --odometry gicp    # by the tables that are kept, without driving
 
 The first drives all sets along the courses of a design and along recordings (ADAPTUNE_TEST_DATA
@@ -216,9 +216,9 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--odometry", default="gicp")
-    parser.add_argument("--sets", type=int, default=40)
+    parser.add_argument("--sets", type=int, default=23)
     parser.add_argument("--courses", type=int, default=24)
-    parser.add_argument("--scans", type=int, default=120)
+    parser.add_argument("--scans", type=int, default=80)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, default=6)
     parser.add_argument("--recordings", nargs="*", default=list(OF_RECORDINGS))
@@ -228,14 +228,14 @@ def main() -> None:
         machine.pin(os.getpid())
         places = driven_places(given, given.folder / given.odometry)
         write_places(errors, places)
-        rows = sets_of(given.odometry, given.sets, 0)
+        rows = sets_of(given.odometry, given.sets)
         with replacing(of_sets) as temporary, temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, ["set", *rows[0]])
             writer.writeheader()
             writer.writerows({"set": i, **row} for i, row in enumerate(rows))
     places = read_places(errors)
     evaluate(places, given.size)
-    sets = sets_of(given.odometry, len(places[0].costs), 0)
+    sets = sets_of(given.odometry, len(places[0].costs))
     chosen = portfolio(places, given.size, by_error)
     print("chosen:", *chosen)
     made = written(given.odometry, places, sets, chosen)

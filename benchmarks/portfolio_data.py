@@ -7,18 +7,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from gain_data import DEFAULTS, NO_SEQUENCES, Simulated
 from numpy.typing import NDArray
-from recorded import RECORDINGS, driven
+from recorded import CARS, RECORDINGS, Direction, definition
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 from made_drives import trials_of
 
+from adaptune import yaml12
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
-from adaptune.files import replacing
+from adaptune.files import replacing, write_text
 from adaptune.geometry import invert
 from adaptune.metrics import travelled
 from adaptune.odometry.factory import OdometryFactory
@@ -32,12 +34,16 @@ from adaptune.simulation import Course
 from adaptune.simulation.course import MOTIONS
 from adaptune.simulation.record import SimulatedDrive, SimulatedScan
 from adaptune.space import ParameterSet
+from adaptune.study.references import ensure_references
 from offline.choice import PER_BLOCK
 from offline.config import OfflineConfig, load_study
 from offline.drive import TrialSetup
+from offline.frames import describe
 from offline.labelled import block_means
 from offline.samplers import make_sampler
 
+FIRST = 6
+"""Sets that a search begins with."""
 SCENES = ("cave", "street", "open", "garden", "corridor", "mine")
 SENSORS = ("vlp16", "hdl32e", "hdl64e", "narrow")
 GROUPS = ("robot", "agile", "car")
@@ -97,13 +103,17 @@ def design(seed: int = 0) -> dict[str, tuple[str, Course]]:
     return courses
 
 
-def sets_of(odometry: str, n: int, seed: int) -> list[ParameterSet]:
-    """The baseline and the sets that a search begins with."""
-    sampler = make_sampler(odometry_class(odometry).space, OfflineConfig(initial=n, seed=seed))
+def sets_of(odometry: str, n: int) -> list[ParameterSet]:
+    """The sets that a search begins with, and then points of its Sobol sequence as they are.
+
+    Of the others, every second one is given values of the baseline.
+    """
+    sampler = make_sampler(odometry_class(odometry).space, OfflineConfig(initial=2 * n))
     history: list[tuple[ParameterSet, float]] = []
-    while len(history) < n and (found := sampler.propose(history)) is not None:
+    while len(history) < 2 * n and (found := sampler.propose(history)) is not None:
         history.append((found.parameters, 0.0))
-    return [parameters for parameters, _ in history]
+    numbers = [*range(FIRST), *range(FIRST + 1, 2 * n, 2)]
+    return [history[number][0] for number in numbers[:n]]
 
 
 def scans_of(sensor: str, course: Course, n: int) -> Iterator[SimulatedScan]:
@@ -139,44 +149,53 @@ def drive_course(name: str, odometry: str, n_sets: int, n_scans: int, seed: int)
     changed = {"sub_trajectory": length, "health": HealthCheck(max_speed=2.0 * speed)}
     factory = OdometryFactory(odometry, {}, odometry_class(odometry).space, Limits())
     setup = TrialSetup(DEFAULTS.model_copy(update=changed), factory, NO_SEQUENCES)
-    sets = sets_of(odometry, n_sets, 0)
-    trials = trials_of(setup, sets, name, frames, Simulated(name, scans), memory=0)
-    errors = np.stack([trial.errors for trial in trials], axis=1)
-    known = np.flatnonzero(~np.isnan(errors).any(axis=1))
-    metres = travelled(T_ref_sensor)[known]
+    read = Simulated(name, scans)
+    return drive_sets(setup, name, sensor, frames, read, sets_of(odometry, n_sets), recorded=False)
+
+
+def drive_recording(name: str, odometry: str, n_sets: int, folder: Path) -> Place:
+    """Drive all sets along a recording; estimated references judge a car's drives."""
+    direction = Direction((name,), (), RECORDINGS[name])
+    defined = definition(direction, odometry, n_sets, 0, name in CARS)
+    write_text(path := folder / f"{name}.yaml", yaml12.dump(defined))
+    study = load_study(path, folder=folder / name)
+    study.open()
+    ensure_references(study.sequences, study.training, direction.sub_trajectory)
+    frames = describe(study.config, study.sequences, name).uncut
+    setup = TrialSetup(study.config, study.odometry, study.sequences)
+    of = (setup, name, OF_RECORDINGS[name], frames, study.sequences.open(name))
+    return drive_sets(*of, sets_of(odometry, n_sets), recorded=True)
+
+
+def drive_sets(
+    setup: TrialSetup,
+    name: str,
+    sensor: str,
+    frames: Frames,
+    scans: Any,
+    sets: Sequence[ParameterSet],
+    *,
+    recorded: bool,
+) -> Place:
+    """Drive sets side by side on one pass, along all of a recording."""
+    trials = trials_of(setup, sets, name, frames, scans, memory=0)
+    errors, length = np.stack([t.errors for t in trials], axis=1), setup.config.sub_trajectory
+    known = np.flatnonzero(~np.isnan(errors[:, ~np.isnan(errors).all(axis=0)]).any(axis=1))
+    n, metres = len(frames.stamps), travelled(frames.T_ref_sensor)[known]
     n_blocks = max(1, round((metres[-1] - metres[0]) / (PER_BLOCK * length)))
     block = np.minimum((metres - metres[0]) / (PER_BLOCK * length), n_blocks - 1).astype(int)
     first = np.unique(block, return_index=True)[1]
+    rate = 1e9 / float(np.median(np.diff(frames.stamps)))
+    middle = next(islice(scans.since(int(frames.stamps[n // 2])), 1))
     return Place(
         name,
         sensor,
-        ScanKind.of(scans[n // 2], 1e9 * (n - 1) / float(stamps[-1] - stamps[0])),
-        False,
+        ScanKind.of(middle, rate),
+        recorded,
         known[first] / n,
         block_means(errors[known], block),
         np.array([trial.usage[REGISTER_MS] + trial.usage[PREPARE_MS] for trial in trials]),
         np.array([np.inf if t.failure else float(t.restarted.sum()) for t in trials]),
-    )
-
-
-def drive_recording(name: str, odometry: str, n_sets: int, folder: Path) -> Place:
-    """Drive all sets along a recording."""
-    given = Namespace(folder=folder, sets=n_sets, seed=0, no_reference=False)
-    data = driven(given, name, odometry)
-    (one,) = data.sequences
-    study = load_study(folder / f"{name}.yaml", folder=folder / name)
-    n, stamps = len(one.simulation.stamps), one.simulation.stamps
-    scan = next(islice(study.sequences.open(name), n // 2, None))
-    first = np.unique(one.block, return_index=True)[1]
-    return Place(
-        name,
-        OF_RECORDINGS[name],
-        ScanKind.of(scan, 1e9 / float(np.median(np.diff(stamps)))),
-        True,
-        one.known[first] / n,
-        one.in_blocks(),
-        data.blocks().costs,
-        data.blocks().restarts,
     )
 
 

@@ -224,12 +224,12 @@ ALIKE = [CARS, ("livox_hku_1", "livox_hku_2")]
 """Recordings of one sensor on one kind of robot."""
 
 
-def driven(given: argparse.Namespace, name: str, odometry: str = "gicp") -> LabelledData:
+def driven(given: argparse.Namespace, name: str) -> LabelledData:
     """Drive all sets along all of a recording, unless that was done, and read how they did."""
     direction = Direction((name,), (), RECORDINGS[name])
     # Sets differ by less than a car's reference is wrong.
     estimated = given.no_reference or name in CARS
-    defined = definition(direction, odometry, given.sets, given.seed, estimated)
+    defined = definition(direction, "gicp", given.sets, given.seed, estimated)
     defined["offline"] = {"initial": given.sets, "trials": given.sets, "seed": given.seed}
     defined["offline"] |= {"stretches": "all", "workers": 1}
     folder = given.folder / name.partition(":")[0]
