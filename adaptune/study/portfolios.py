@@ -24,7 +24,8 @@ def portfolio_sets(
             what = f"is of {portfolio.odometry}, and tuned is {', '.join(config.odometries)}"
             raise PortfolioError(f"{path}: odometry: {what}; name another portfolio")
         if portfolio.digest != digest:
-            said.append(f"{path} has changed since this study began ({digest}), and is not used")
+            what = "is not the one that this study began with, and is not used"
+            said.append(f"{path} {what}: {portfolio.digest}, not {digest}")
             continue
         one = config.odometries[label]
         own = space.spaces[label] if isinstance(space, PooledSpace) else space

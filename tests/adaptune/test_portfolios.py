@@ -45,7 +45,7 @@ def test_one_that_has_changed_is_not_used(study_file, tmp_path, portfolio, caplo
     study = loaded(study_file, tmp_path, f"offline.portfolio={{{given}}}")
     portfolio(sets=(FAR,))
     assert study.portfolio == ()
-    assert f"{path} has changed since this study began" in caplog.text
+    assert f"{path} is not the one that this study began with, and is not used: " in caplog.text
 
 
 def test_of_several_odometries_each_has_its_sets_in_turn(study_file, tmp_path, portfolio):
