@@ -38,6 +38,7 @@ class Proposal(NamedTuple):
     source: str
 
 
+Sets = Sequence[ParameterSet]
 History = Sequence[tuple[ParameterSet, float]]
 """Sets that were tried and their values, which samplers minimise."""
 
@@ -181,9 +182,7 @@ class AskedSampler(Sampler):
     asked again. After many attempts, a random set is taken.
     """
 
-    def __init__(
-        self, space: ParameterSpace, config: OfflineConfig, first: Sequence[ParameterSet] = ()
-    ):
+    def __init__(self, space: ParameterSpace, config: OfflineConfig, first: Sets = ()):
         super().__init__(space, config)
         self._first, self._n_initial = first, max(config.n_initial, 1 + len(first))
         self._distributions = {
@@ -333,9 +332,7 @@ class PooledSampler(Sampler):
 
     space: PooledSpace
 
-    def __init__(
-        self, space: PooledSpace, config: OfflineConfig, first: Sequence[ParameterSet] = ()
-    ):
+    def __init__(self, space: PooledSpace, config: OfflineConfig, first: Sets = ()):
         super().__init__(space, config)
         n = len(space.spaces)
         firsts: dict[str, list[ParameterSet]] = {label: [] for label in space.spaces}
@@ -383,9 +380,7 @@ class PooledSampler(Sampler):
         return sorted(every, key=lambda one: (1 + ranked.index(one)) * (2 * had[one] + 1))
 
 
-def make_sampler(
-    space: ParameterSpace, config: OfflineConfig, first: Sequence[ParameterSet] = ()
-) -> Sampler:
+def make_sampler(space: ParameterSpace, config: OfflineConfig, first: Sets = ()) -> Sampler:
     """Make the sampler that a configuration names; `first` are sets to try after the baseline."""
     if isinstance(space, PooledSpace):
         return PooledSampler(space, config, first)
