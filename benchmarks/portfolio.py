@@ -21,7 +21,7 @@ The tables go to ``benchmarks/portfolio/NAME-errors.csv`` and ``NAME-sets.csv``,
 import argparse
 import csv
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date
 from functools import partial
 from hashlib import blake2b
@@ -135,32 +135,48 @@ def left_out(
     )
 
 
-def line(what: str, found: Sequence[tuple[float, float]], base: Sequence[float] = ()) -> str:
-    """Geometric means of ratios and costs, the worst ratio, and the difference to other ones."""
+def interval(differences: NDArray[np.float64]) -> str:
+    """A mean, with Student's 95 % interval."""
+    margin = stats.t.ppf(0.975, len(differences) - 1) * stats.sem(differences)
+    mean = differences.mean()
+    return f"{mean:+.2f} ({mean - margin:+.2f} to {mean + margin:+.2f})"
+
+
+def line(
+    what: str,
+    found: Sequence[tuple[float, float]],
+    others: Mapping[str, NDArray[np.float64]],
+    sensors: Sequence[str],
+) -> str:
+    """Geometric means of ratios and costs, the worst ratio, and differences to `others`' logs.
+
+    Intervals are over the recordings, and over their sensors.
+    """
     ratios, costs = np.array(found).T
-    said = f"{what:44} {np.exp(np.log(ratios).mean()):.2f}; {ratios.max():.2f}"
-    said += f"   cost {np.exp(np.log(costs).mean()):.2f}"
-    if len(base):
-        difference = np.log(ratios) - np.log(base)
-        margin = stats.t.ppf(0.975, len(base) - 1) * stats.sem(difference)
-        low, high = difference.mean() - margin, difference.mean() + margin
-        said += f"   to Sobol's {difference.mean():+.2f} ({low:+.2f} to {high:+.2f})"
+    said = f"{what:42} {np.exp(np.log(ratios).mean()):.2f}; {ratios.max():.2f}"
+    said += f"  cost {np.exp(np.log(costs).mean()):.2f}"
+    for other, logs in others.items():
+        difference = np.log(ratios) - logs
+        by_sensor = [difference[np.array(sensors) == s].mean() for s in sorted({*sensors})]
+        said += f"  to {other} {interval(difference)}, {interval(np.array(by_sensor))}"
     return said
 
 
 def evaluate(places: Sequence[Place], n: int) -> None:
     """Print what each choice of candidates gives on the recordings."""
     recordings, rng = [place for place in places if place.recorded], np.random.default_rng(0)
-    n_sets = len(places[0].costs)
+    n_sets, sensors = len(places[0].costs), [place.sensor for place in recordings]
     sobol = [tested(place, range(n)) for place in recordings]
-    base = [ratio for ratio, _ in sobol]
-    print(f"{len(recordings)} recordings, {len(places) - len(recordings)} courses; {n} candidates")
-    print(line(f"the first {n} of the search", sobol))
-    print(line(f"all {n_sets}", [tested(p, range(n_sets)) for p in recordings], base))
     draws = [[0, *(1 + rng.permutation(n_sets - 1)[: n - 1])] for _ in range(DRAWS)]
-    at_random = [[tested(place, few) for place in recordings] for few in draws]
-    middle = np.argsort([np.log(of)[:, 0].mean() for of in map(np.array, at_random)])[DRAWS // 2]
-    print(line(f"{n} at random, the median of {DRAWS}", at_random[middle], base))
+    at_random = np.array([[tested(place, few) for place in recordings] for few in draws])
+    logs = np.log(at_random)
+    others = {"Sobol": np.log(np.array(sobol)[:, 0]), "random": logs[..., 0].mean(axis=0)}
+    middle = at_random[np.argsort(logs[..., 0].mean(axis=1))[DRAWS // 2]].tolist()
+    print(f"{len(recordings)} recordings, {len(places) - len(recordings)} courses; {n} candidates")
+    print(line(f"the first {n} of the search", sobol, {}, sensors))
+    print(line(f"{n} at random, the median of {DRAWS}", middle, {}, sensors))
+    every = [tested(place, range(n_sets)) for place in recordings]
+    print(line(f"all {n_sets}", every, others, sensors))
     for objective in (by_error, with_price, within_budget):
         for of_courses in (1.0, 1.0 / 3.0, 0.0):
             for sensor in (False, True):
@@ -168,7 +184,7 @@ def evaluate(places: Sequence[Place], n: int) -> None:
                 found = [tested(p, left_out(p, places, sensor, make)) for p in recordings]
                 what = f"{objective.__name__}, a course {of_courses:.2g}"
                 without = "sensor" if sensor else "recording"
-                print(line(f"{what}, without the {without}", found, base))
+                print(line(f"{what}, without the {without}", found, others, sensors))
                 each = (f"{p.name} {r:.2f}" for p, (r, _) in zip(recordings, found, strict=True))
                 print("   ", ", ".join(each), flush=True)
 
