@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from portfolio import TABLES, by_error, left_out, portfolio, written
+from portfolio import TABLES, as_text, left_out, portfolio, within_budget, written
 from portfolio_data import OF_RECORDINGS, Place, read_places, sets_of
 from recorded import CARS, RECORDINGS, Direction, definition
 
@@ -43,10 +43,10 @@ WITH, WITHOUT = "portfolio", "none"
 
 def written_without(place: Place, places: list[Place], odometry: str, n: int, path: Path) -> str:
     """Write the portfolio that is chosen without a sensor; its file and digest for a study."""
-    make = partial(portfolio, n=n, objective=by_error)
+    make = partial(portfolio, n=n, objective=within_budget)
     chosen = left_out(place, places, sensor=True, choose_sets=make)
     made = written(odometry, places, sets_of(odometry, len(place.costs)), chosen)
-    write_text(path, yaml12.dump(made.model_dump(mode="json")))
+    write_text(path, as_text(made))
     return read_portfolio(str(path)).digest
 
 
