@@ -543,8 +543,8 @@ CANDIDATES = 16
 """Sets that the members of a bank are chosen from; a power of two, as Sobol's points want it."""
 
 
-WITH_PORTFOLIO = 3
-"""Members of a bank from a portfolio: they are better than others, and a dense one is dear."""
+WITH_PORTFOLIO = 2
+"""Members of a bank with a set of a portfolio: a third one costs more, and gained nothing sure."""
 
 
 def untrained_sets(

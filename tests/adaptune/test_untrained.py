@@ -65,8 +65,7 @@ def test_of_several_odometries_all_baselines_are_in_the_bank():
 
 def test_a_portfolio_gives_the_members():
     first = [{**SPACE.baseline, "size": n} for n in (2, 7, 9)]
-    assert untrained_sets(SPACE, 4, first).parameters == (SPACE.baseline, *first[:2])
-    assert untrained_sets(SPACE, 2, first).parameters == (SPACE.baseline, first[0])
+    assert untrained_sets(SPACE, 4, first).parameters == (SPACE.baseline, first[0])
     space = PooledSpace({"first": SPACE, "second": SPACE})
     of_second = [{ODOMETRY: "second", **one} for one in first]
-    assert list(untrained_sets(space, 4, of_second).parameters) == [*space.baselines, of_second[0]]
+    assert list(untrained_sets(space, 4, of_second).parameters) == space.baselines

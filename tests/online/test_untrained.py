@@ -191,4 +191,4 @@ def test_members_are_the_first_of_the_portfolio(load, tmp_path):
     (path := tmp_path / "mine.yaml").write_text(yaml12.dump(data))
     given = f"offline.portfolio={{{path}: {read_portfolio(str(path)).digest}}}"
     mode = ReplaySetup.of(load(given)).mode("untrained")
-    assert list(mode.sets.values()) == sets[:3]
+    assert list(mode.sets.values()) == sets[:2]
