@@ -543,24 +543,21 @@ CANDIDATES = 16
 """Sets that the members of a bank are chosen from; a power of two, as Sobol's points want it."""
 
 
-WITH_PORTFOLIO = 2
-"""Members of a bank with a set of a portfolio: a third one costs more, and gained nothing sure."""
-
-
 def untrained_sets(
     space: ParameterSpace, n: int = 4, portfolio: Sequence[ParameterSet] = ()
 ) -> ParameterSets:
-    """The baseline, and the first sets of a portfolio, numbered from 0.
+    """The baseline, and the first set of a portfolio, numbered from 0.
 
-    Without one, they are sets around the baseline that are far from each other. Of several
-    odometries, the baselines of all come first, then sets of the first one. The
-    candidates are points of a scrambled Sobol sequence, moved half-way to the baseline: what
-    the odometry's authors chose is the best guess there is. Each next set is the one that is
-    farthest from those chosen before. There are fewer than `n` if the candidates are equal.
+    A second one costs more, and gained nothing sure. Without a portfolio, they are sets around the
+    baseline that are far from each other. Of several odometries, the baselines of all come first,
+    then sets of the first one. The candidates are points of a scrambled Sobol sequence, moved
+    half-way to the baseline: what the odometry's authors chose is the best guess there is. Each
+    next set is the one that is farthest from those chosen before. There are fewer than `n` if the
+    candidates are equal.
     """
     chosen = space.baselines[:n]
     if portfolio:
-        chosen += portfolio[: max(0, min(n, WITH_PORTFOLIO) - len(chosen))]
+        chosen = [*chosen, portfolio[0]][:n]
     elif isinstance(space, PooledSpace):
         first = next(iter(space.spaces.items()))
         around = untrained_sets(first[1], n - len(chosen) + 1).parameters[1:]

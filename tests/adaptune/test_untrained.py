@@ -68,4 +68,5 @@ def test_a_portfolio_gives_the_members():
     assert untrained_sets(SPACE, 4, first).parameters == (SPACE.baseline, first[0])
     space = PooledSpace({"first": SPACE, "second": SPACE})
     of_second = [{ODOMETRY: "second", **one} for one in first]
-    assert list(untrained_sets(space, 4, of_second).parameters) == space.baselines
+    assert list(untrained_sets(space, 4, of_second).parameters) == [*space.baselines, of_second[0]]
+    assert list(untrained_sets(space, 2, of_second).parameters) == space.baselines
