@@ -28,7 +28,14 @@ from adaptune.model.rules import NOVEL_FAMILIARITY, Live
 from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
-from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace, Selection
+from adaptune.space import (
+    ODOMETRY,
+    ParameterSet,
+    ParameterSets,
+    ParameterSpace,
+    PooledSpace,
+    Selection,
+)
 
 SCANS_TO_KNOW = 10
 """The sensor is recognised by the median over this many scans that selections are made from."""
@@ -539,16 +546,22 @@ CANDIDATES = 16
 """Sets that the members of a bank are chosen from; a power of two, as Sobol's points want it."""
 
 
-def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
-    """The baseline, and sets around it that are far from each other, numbered from 0.
+def untrained_sets(
+    space: ParameterSpace, n: int = 4, portfolio: Sequence[ParameterSet] = ()
+) -> ParameterSets:
+    """The baseline, and the first set of a portfolio, numbered from 0.
 
-    Of several odometries, the baselines of all come first, then sets of the first one. The
-    candidates are points of a scrambled Sobol sequence, moved half-way to the baseline: what
-    the odometry's authors chose is the best guess there is. Each next set is the one that is
-    farthest from those chosen before. There are fewer than `n` if the candidates are equal.
+    A second one costs more, and gained nothing sure. Without a portfolio, they are sets around the
+    baseline that are far from each other. Of several odometries, the baselines of all come first,
+    then sets of the first one. The candidates are points of a scrambled Sobol sequence, moved
+    half-way to the baseline: what the odometry's authors chose is the best guess there is. Each
+    next set is the one that is farthest from those chosen before. There are fewer than `n` if the
+    candidates are equal.
     """
     chosen = space.baselines[:n]
-    if isinstance(space, PooledSpace):
+    if portfolio:
+        chosen = [*chosen, portfolio[0]][:n]
+    elif isinstance(space, PooledSpace):
         first = next(iter(space.spaces.items()))
         around = untrained_sets(first[1], n - len(chosen) + 1).parameters[1:]
         chosen += [{ODOMETRY: first[0], **own} for own in around]

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -305,7 +305,10 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
 
 
 class Campaign:
-    """Runs the search of a study, in the time that `expected` says its sets take."""
+    """Runs the search of a study, in the time that `expected` says its sets take.
+
+    Once the sets of a portfolio are done, and others follow, `tell` is called with them.
+    """
 
     def __init__(
         self,
@@ -315,6 +318,7 @@ class Campaign:
         progress: Progress = unseen,
         clock: Stopwatch | None = None,
         expected: Forecast = Forecast(0.0, 0.0),  # noqa: B008 (a tuple)
+        tell: Callable[[Mapping[int, Verdict]], None] = lambda _: None,
     ):
         self._workers, self._progress, self._expected = workers, progress, expected
         self._config, self._names = study.config.offline, study.training
@@ -322,7 +326,9 @@ class Campaign:
         self._begun = self._clock.hours
         self._finished = {name: archive.finished(name) for name in self._names}
         space, known = study.odometry.space, archive.known()
-        self._search = Search(self._config, space, self._finished, known)
+        first, self._tell = study.portfolio, tell
+        self._search = Search(self._config, space, self._finished, known, first)
+        self._first = range(len(space.baselines) + len(first)) if first else range(0)
         self._schedule = Schedule(study, archive, "runs", self._show)
         self._baselines = range(len(space.baselines))
         self._schedule.most_ms = {
@@ -335,10 +341,14 @@ class Campaign:
         """Run all trials that are not in the archive yet, and judge all of them by number."""
         search = self._search
         self._begin()
+        told = search.done.keys() >= {*self._first}
         for name, number, trial in self._schedule.run(self._workers):
             self._schedule.store(name, number, replace(trial, source=search.sources[number]))
             self._clock.save()
             self._begin()
+            if not told and search.done.keys() >= {*self._first} and search.end is None:
+                told = True
+                self._tell({n: search.done[n] for n in self._first})
         self._schedule.close()
         if search.end == TIME_IS_UP:
             # The same command again begins no more.

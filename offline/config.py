@@ -24,6 +24,7 @@ from adaptune.space import (
 )
 from adaptune.strict import ConfigurationError, StrictModel, validated
 from adaptune.study.config import StudyConfig
+from adaptune.study.portfolios import portfolio_sets
 from adaptune.study.study import CONFIGURATION, Study
 
 OPTUNA = {"tpe": "optuna.samplers:TPESampler"}
@@ -371,6 +372,10 @@ def _weighted(given: Any) -> Any:
     return {given: 1.0} if isinstance(given, str) else given
 
 
+def _portfolios(given: Any) -> Any:
+    return {} if given == "none" else given
+
+
 TRIALS, INITIAL = 64, 0.25
 """Trials of a search without a budget, and the share of all that are not proposed by results."""
 
@@ -393,6 +398,8 @@ class OfflineConfig(StrictModel):
     stretches: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 12
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
+    # Portfolios that the search begins with, and the digest of each.
+    portfolio: Annotated[dict[str, str], BeforeValidator(_portfolios)] = Field(default_factory=dict)
 
     @property
     def most_trials(self) -> int | None:
@@ -434,7 +441,7 @@ class OfflineConfig(StrictModel):
 
 _SEARCH = (
     *("sampler", "sampler_settings", "initial", "batch", "seed"),
-    *("objective", "stretches", "repeats", "baseline_runs"),
+    *("objective", "stretches", "repeats", "baseline_runs", "portfolio"),
 )
 """Settings by which a search differs from another."""
 
@@ -457,7 +464,17 @@ class OfflineStudyConfig(StudyConfig):
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Finding]:
         """See `StudyConfig.mistakes`."""
-        return (mistake.below(("offline",)) for mistake in self.offline.mistakes(space))
+        yield from (mistake.below(("offline",)) for mistake in self.offline.mistakes(space))
+        if space is not None:
+            try:
+                portfolio_sets(self, space)
+            except AdaptuneError as error:
+                yield Finding(("offline", "portfolio"), str(error))
+
+    @property
+    def portfolios(self) -> Mapping[str, str]:
+        """See `StudyConfig.portfolios`; neither a grid nor random search begins with any."""
+        return {} if self.offline.sampler in ("grid", "random") else self.offline.portfolio
 
     def resolved(self) -> dict[str, Any]:
         """See `StudyConfig.resolved`."""

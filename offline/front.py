@@ -22,6 +22,7 @@ from offline.choice import (
     Elsewhere,
     allowed_cost,
     bounds,
+    choose,
     elsewhere,
     mean_and_error,
     why_not,
@@ -75,6 +76,20 @@ def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> lis
         rows.append(row | {"trial": None, "_bound": None})
     rows = [row | {"left out": left_out if row["recommended"] else ""} for row in rows]
     return sorted(rows, key=lambda row: row[COST])
+
+
+def in_short(data: LabelledData) -> str:
+    """What trials that are done would recommend."""
+    blocks = data.blocks()
+    if (trial := choose(blocks, data.budget)) in blocks.defaults:
+        return "so far, none is safely better than the odometry's own parameters"
+    ratio, costs = elsewhere(blocks, trial).ratio, data.costs
+    own = costs.alone(blocks.trials[blocks.baseline])
+    return (
+        f"so far, trial {trial} is the best ({in_words(data.sets[trial])}), with {ratio:.2f} times "
+        f"the error of the odometry's own parameters, for {costs.alone(trial):.1f} instead of "
+        f"{own:.1f} ms a scan"
+    )
 
 
 def _row(roles: Sequence[str], error: float, cost: float, ratio: Elsewhere) -> dict[str, Any]:

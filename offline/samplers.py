@@ -34,9 +34,11 @@ class Proposal(NamedTuple):
     """A parameter set to try."""
 
     parameters: ParameterSet
-    source: str  # `baseline`, `sobol` (initial points), `random`, or the sampler's name
+    # `baseline`, `portfolio` and `sobol` (initial points), `random`, or the sampler's name
+    source: str
 
 
+Sets = Sequence[ParameterSet]
 History = Sequence[tuple[ParameterSet, float]]
 """Sets that were tried and their values, which samplers minimise."""
 
@@ -169,7 +171,7 @@ def sobol_points(space: ParameterSpace, seed: int, numbers: range) -> list[Param
 
 
 class AskedSampler(Sampler):
-    """Begins with points of a Sobol sequence, and then asks an Optuna sampler.
+    """Begins with sets that are given and points of a Sobol sequence, then asks Optuna's sampler.
 
     Many Optuna samplers keep notes on the trials that they proposed. A resumed search therefore
     asks again for the earlier proposals, and answers from the history. Samplers without notes
@@ -180,8 +182,9 @@ class AskedSampler(Sampler):
     asked again. After many attempts, a random set is taken.
     """
 
-    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+    def __init__(self, space: ParameterSpace, config: OfflineConfig, first: Sets = ()):
         super().__init__(space, config)
+        self._first, self._n_initial = first, max(config.n_initial, 1 + len(first))
         self._distributions = {
             name: optuna.distributions.CategoricalDistribution(range(len(p.choices)))
             if isinstance(p, Categorical)
@@ -237,7 +240,7 @@ class AskedSampler(Sampler):
         config = self.config
         if config.sampler == "annealing":
             settings = AnnealingSettings.model_validate(config.sampler_settings)
-            return AnnealingSampler(settings, n_startup_trials=config.n_initial, seed=config.seed)
+            return AnnealingSampler(settings, n_startup_trials=self._n_initial, seed=config.seed)
         # The initial points are the start-up; TPE needs no random points of its own.
         usual = {"n_startup_trials": 1} if config.sampler == "tpe" else {}
         seed = int(np.random.SeedSequence((config.seed, number)).generate_state(1)[0])
@@ -245,12 +248,7 @@ class AskedSampler(Sampler):
 
     def _ask(self, number: int) -> Proposal | None:
         """Ask for the set of a trial."""
-        given: Proposal | None = None
-        if not number:
-            given = Proposal(self.space.baseline, "baseline")
-        elif number < self.config.n_initial:
-            (point,) = sobol_points(self.space, self.config.seed, range(number, number + 1))
-            given = self._crossed(Proposal(point, "sobol"), number)
+        given = self._initial(number)
         for attempt in range(_ATTEMPTS):
             if attempt == _ATTEMPTS - 1:
                 rng = np.random.default_rng((self.config.seed, number, 1))
@@ -272,6 +270,17 @@ class AskedSampler(Sampler):
                 self._asked.append(found.parameters)
                 return found
         raise AssertionError
+
+    def _initial(self, number: int) -> Proposal | None:
+        """The set of a trial that no result proposes."""
+        if not number:
+            return Proposal(self.space.baseline, "baseline")
+        if number <= len(self._first):
+            return Proposal(self._first[number - 1], "portfolio")
+        if number >= self._n_initial:
+            return None
+        (point,) = sobol_points(self.space, self.config.seed, range(number, number + 1))
+        return self._crossed(Proposal(point, "sobol"), number)
 
     def _crossed(self, found: Proposal, number: int) -> Proposal:
         """Of TPE, give every second set about half of the baseline's values.
@@ -323,15 +332,20 @@ class PooledSampler(Sampler):
 
     space: PooledSpace
 
-    def __init__(self, space: PooledSpace, config: OfflineConfig):
+    def __init__(self, space: PooledSpace, config: OfflineConfig, first: Sets = ()):
         super().__init__(space, config)
         n = len(space.spaces)
-        self._n_initial = max(config.n_initial, n)
+        firsts: dict[str, list[ParameterSet]] = {label: [] for label in space.spaces}
+        for label, own_set in map(space.split, first):
+            firsts[label].append(own_set)
+        self._n_initial = max(config.n_initial, n * (1 + max(map(len, firsts.values()))))
         turns = [len(range(i, self._n_initial, n)) for i in range(n)]
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(n).tolist()
         of_each = zip(space.spaces.items(), turns, seeds, strict=True)
         self._samplers = {
-            label: make_sampler(own, config.model_copy(update={"initial": initial, "seed": seed}))
+            label: make_sampler(
+                own, config.model_copy(update={"initial": initial, "seed": seed}), firsts[label]
+            )
             for (label, own), initial, seed in of_each
         }
 
@@ -366,10 +380,10 @@ class PooledSampler(Sampler):
         return sorted(every, key=lambda one: (1 + ranked.index(one)) * (2 * had[one] + 1))
 
 
-def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
-    """Make the sampler that a configuration names."""
+def make_sampler(space: ParameterSpace, config: OfflineConfig, first: Sets = ()) -> Sampler:
+    """Make the sampler that a configuration names; `first` are sets to try after the baseline."""
     if isinstance(space, PooledSpace):
-        return PooledSampler(space, config)
+        return PooledSampler(space, config, first)
     if config.sampler == "random" and config.sampler_settings.get("grid") is None:
         return RandomSampler(space, config)
     if config.sampler in ("grid", "random"):
@@ -380,4 +394,4 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
         history: list[tuple[ParameterSet, float]] = []
         while len(history) < 3 and (proposed := rehearsal.propose(history)) is not None:
             history.append((proposed.parameters, 1.0 + len(history)))
-    return AskedSampler(space, config)
+    return AskedSampler(space, config, first)

@@ -63,10 +63,10 @@ Finished = Mapping[str, Mapping[int, Summary]]
 class Search:
     """The search, trial by trial.
 
-    Trial 0 is the baseline. `OfflineConfig.batch` trials run at a time: a set follows from the
-    results of all trials but the last ones before it. So it does not matter when each of them
-    finished, nor how often the search was stopped. A number keeps its set: one that ran on any
-    sequence is not proposed anew where others are added.
+    Trial 0 is the baseline; the `first` sets follow. `OfflineConfig.batch` trials run at a time: a
+    set follows from the results of all trials but the last ones before it. So it does not matter
+    when each of them finished, nor how often the search was stopped. A number keeps its set: one
+    that ran on any sequence is not proposed anew where others are added.
     """
 
     def __init__(
@@ -75,20 +75,21 @@ class Search:
         space: ParameterSpace,
         finished: Finished,
         known: Mapping[int, Summary],
+        first: Sequence[ParameterSet] = (),
     ):
         self.sets: dict[int, ParameterSet] = {}  # by number, in the order in which they began
         self.sources: dict[int, str] = {}  # what proposed each, see `Proposal`
         self.done: dict[int, Verdict] = {}  # by number, those that are finished everywhere
         self.end: str | None = None  # why no more trials begin
         self._config, self._space, self._limit = config, space, config.most_trials
-        self._finished, self._known = finished, dict(known)
+        self._finished, self._known, self._first = finished, dict(known), first
 
     @cached_property
     def _sampler(self) -> "Sampler":
         # Where nothing is to be proposed, it is not needed, and Optuna takes a second to import.
         from offline.samplers import make_sampler
 
-        return make_sampler(self._space, self._config)
+        return make_sampler(self._space, self._config, self._first)
 
     @property
     def best(self) -> int:

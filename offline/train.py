@@ -47,7 +47,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import ANY, COST, EQUAL, FILES, front_rows, left_out
+from offline.front import ANY, COST, EQUAL, FILES, front_rows, in_short, left_out
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -169,8 +169,17 @@ def _searched(
     most = 3600.0 * ((config.hours or np.inf) - clock.hours)
     if left > 0 and most > 0.0 and min(left, most) < np.inf:
         _log.info("%s", expected.words(left, most))
-    campaign = Campaign(study, archive, workers, progress, clock, expected)
+    tell = partial(_say_so_far, study, archive)
+    campaign = Campaign(study, archive, workers, progress, clock, expected, tell)
     return campaign.run(), campaign.words
+
+
+def _say_so_far(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]) -> None:
+    """Say what the sets of the portfolio recommend, before others are tried."""
+    tried = tuple(verdict.parameters for verdict in verdicts.values())
+    sets = ParameterSets(study.odometry.space, tuple(verdicts), tried)
+    data = labelled_data(study, archive, sets).usable()
+    _log.info("after %d sets: %s; the search goes on", len(tried), in_short(data))
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:

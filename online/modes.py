@@ -106,12 +106,14 @@ class ReplaySetup:
     mechanism: Mechanism | None  # how the odometry changes its parameters
     rules: tuple[str, ...]  # selection rules to compare
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
+    portfolio: tuple[ParameterSet, ...] = ()  # sets that are known to do well in some places
 
     @classmethod
     def of(cls, study: Study) -> Self:
         """The setup of a study."""
         also = study.config.online.also
-        return cls(study.config, study.odometry, study.mechanism, study.rules, also)
+        of = (study.config, study.odometry, study.mechanism, study.rules)
+        return cls(*of, also, study.portfolio)
 
     def mode(self, name: str, model: ErrorModel | None = None) -> Mode:
         """What a mode runs.
@@ -238,7 +240,8 @@ class ReplaySetup:
         return {trial: s for trial, s in self._members(model).items() if trial not in reserve}
 
     def _untrained_sets(self) -> ParameterSets:
-        return untrained_sets(self.odometry.space, self.config.online.switching.size)
+        n = self.config.online.switching.size
+        return untrained_sets(self.odometry.space, n, self.portfolio)
 
 
 def _cost(model: ErrorModel, members: Iterable[int]) -> float:

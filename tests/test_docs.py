@@ -29,6 +29,7 @@ import adaptune
 from adaptune import yaml12
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, FixedSet
+from adaptune.odometry.portfolio import Portfolio
 from adaptune.odometry.registry import ODOMETRIES, declare_here
 from adaptune.recording import SequenceConfig
 from adaptune.strict import ConfigurationError
@@ -323,6 +324,8 @@ def test_yaml_is_valid(page, block, tmp_path, monkeypatch):
     if page == "docker.md" and "play" in data:
         settings = {"image": "a", "template": "a.yaml", "odometry": "/odometry"} | data
         assert declare_here("rustle", settings).mistakes == []
+    elif page == "portfolios.md":
+        Portfolio.model_validate(data)
     elif set(data) <= set(SequenceConfig.model_fields):
         SequenceConfig.model_validate(recording | data)
     elif set(data) <= set(fields):

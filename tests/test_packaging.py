@@ -59,6 +59,7 @@ def test_the_wheel_tunes_a_bag_without_the_repository(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path / "installed")
+    assert "adaptune/odometry/portfolios/gicp.yaml" in names
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {
         *("adaptune", "offline", "online")
     }

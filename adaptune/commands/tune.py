@@ -63,7 +63,7 @@ def inspect(
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
-    from adaptune.tuning.studies import ROLES, proposed, roles
+    from adaptune.tuning.studies import ROLES, begin_of_search, proposed, roles
     from adaptune.yaml12 import dump
 
     if _show_several(file, reading):
@@ -80,7 +80,7 @@ def inspect(
             "serve, write `reference: estimated`"
         )
         return
-    rest = roles([found.name], length, {"name": "gicp"}, share)
+    rest = roles([found.name], length, {"name": "gicp"}, share) | begin_of_search(["gicp"])
     say(dump(rest, ROLES))
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "
@@ -210,6 +210,12 @@ Budget = Annotated[
 ]
 
 
+Portfolio = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Parameter sets to try first, in place of ours; or none."),
+]
+
+
 Bags = Annotated[
     list[Path],
     typer.Argument(
@@ -252,6 +258,7 @@ def tune(
     trials: Trials = None,
     minutes: Minutes = None,
     budget: Budget = None,
+    portfolio: Portfolio = None,
     override: Override = [],  # noqa: B006
     folder: Kept = None,
     cluster: Cluster = None,
@@ -271,7 +278,7 @@ def tune(
     from adaptune.tuning.tuned import tune_asked
 
     odometry = odometry or ("gicp" if config is None else "kiss_icp")
-    limits = (trials, minutes, budget)
+    limits = (trials, minutes, budget, portfolio)
     asked = Asked(recordings, odometry, points, reference, config, test, reading, {}, *limits)
     with progress() as show:
         if (path := proposed_system(asked, folder, show)) is None:

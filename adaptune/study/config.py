@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from typing import Annotated, Any, Literal, NamedTuple
@@ -246,9 +246,14 @@ class StudyConfig(StrictModel):
     def mistakes(self, space: ParameterSpace | None) -> "Iterable[Finding]":  # noqa: ARG002
         """Find what does not fit the tuned parameters; None where these have mistakes.
 
-        A stage that adds settings of its own overrides it, and `resolved`.
+        A stage that adds settings of its own overrides it, `portfolios` and `resolved`.
         """
         return ()
+
+    @property
+    def portfolios(self) -> Mapping[str, str]:
+        """Odometries whose portfolio is used, or files of portfolios, and the digest of each."""
+        return {}
 
     def resolved(self) -> dict[str, Any]:
         """The configuration as plain data, with nothing left to defaults."""

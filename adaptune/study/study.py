@@ -24,6 +24,7 @@ from adaptune.odometry.registry import declare
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import OdometryConfig, StudyConfig
+from adaptune.study.portfolios import portfolio_sets
 from adaptune.study.sequences import StudySequences
 
 CONFIGURATION = "study.yaml"
@@ -103,6 +104,14 @@ class Study(Generic[C_co]):
         odometries = self.config.odometries
         factories = {label: self._factory(config) for label, config in odometries.items()}
         return OdometryPool(factories) if len(factories) > 1 else next(iter(factories.values()))
+
+    @cached_property
+    def portfolio(self) -> tuple[ParameterSet, ...]:
+        """The sets of its portfolios, see `portfolio_sets`."""
+        sets, said = portfolio_sets(self.config, self.odometry.space)
+        for what in said:
+            _log.warning("offline.portfolio: %s", what)
+        return sets
 
     def _factory(self, config: OdometryConfig) -> OdometryFactory:
         settings, described = declared_odometry(config)

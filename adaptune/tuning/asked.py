@@ -37,6 +37,7 @@ class Asked(NamedTuple):
     trials: int | None = None
     minutes: float | None = None
     budget: float | str | None = None
+    portfolio: str | None = None  # a file, or none; by default those that adaptune brings
 
     @property
     def limits(self) -> dict[str, float | str]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from adaptune import manifest
@@ -175,6 +176,7 @@ def _decided(
     from adaptune.odometry.registry import declare
     from offline.config import load_study
 
+    begin_of_search([], asked.portfolio)
     about = {name: manifest.plain(given) for name, given in asked.about.items()}
     for name in odometries_of(asked.odometry, True):
         # A wrong one is known before all is read.
@@ -186,12 +188,13 @@ def _decided(
     if asked.config is not None and len(odometries) != 1:
         raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
     undo_motion([*named.values()], odometries)
+    begin = begin_of_search(odometries, asked.portfolio, named)
     entries: list[Any] = [{"name": n, **about.get(n, {})} for n in odometries]
     if asked.config is not None:
         entries[0]["settings"] = {"config": str(asked.config.resolve())}
     if asked.trials is None and asked.minutes is None:
         asked = asked._replace(trials=max(TRIALS, EACH * len(odometries)))
-    spent: dict[str, dict[str, Any]] = {"offline": {}, "online": {"modes": ["adaptive"]}}
+    spent: dict[str, dict[str, Any]] = {"offline": {}, "online": {"modes": ["adaptive"]}} | begin
     for key, value in asked.limits.items():
         stage, _, name = key.partition(".")
         spent[stage][name] = value
@@ -215,6 +218,31 @@ def _decided(
     made = study(length, share) | {"health": {"max_speed": speed}}
     load_study(made, overrides, folder)
     return made
+
+
+def begin_of_search(
+    odometries: Sequence[str],
+    given: str | None = None,
+    recordings: "Mapping[str, Inspection]" = MappingProxyType({}),
+) -> dict[str, dict[str, Any]]:
+    """The portfolios that a search begins with, as a study names them, if there are any.
+
+    A file, or `none`, may be `given`. It is told where a recording is unlike what they know.
+    """
+    from adaptune.odometry.portfolio import ScanKind, portfolios_of, read_portfolio
+
+    found = portfolios_of(odometries, given)
+    for portfolio in map(read_portfolio, found):
+        for name, one in recordings.items():
+            topic = one.topics.get(one.used.get("points", ""))
+            if topic is None or one.scan is None or not topic.rate:
+                continue
+            if what := portfolio.unlike(ScanKind.of(one.scan, topic.rate)):
+                _log.warning(
+                    f"{name}: its scans are unlike those that the portfolio of "
+                    f"{portfolio.odometry} was chosen on: {what}. It says little here"
+                )
+    return {"offline": {"portfolio": found}} if found else {}
 
 
 def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:

@@ -178,6 +178,7 @@ def tune(
     trials: int | None = None,
     minutes: float | None = None,
     budget: float | str | None = None,
+    portfolio: str | Path | None = None,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     cluster: str | None = None,
@@ -205,8 +206,8 @@ def tune(
     trials, minutes, budget
         Parameter sets to try, time for all of it, and the CPU time a scan that may be spent:
         milliseconds, or ``"3x"``, times what the baseline takes; by default twice as much.
-    overrides, folder
-        Values of the study, as in ``["offline.seed=1"]``, and where all results go.
+    overrides, folder, portfolio
+        Of the study, as in ``["offline.seed=1"]``; where results go; sets to try first (a file).
     cluster
         Address of a Dask scheduler whose workers run the trials.
     progress
@@ -216,9 +217,9 @@ def tune(
         raise AdaptuneError(f"reading: give 'one' or 'several', not {reading!r}")
     overrides = [overrides] if isinstance(overrides, str) else overrides
     name, about = named_odometry(odometry or ("gicp" if config is None else "kiss_icp"))
-    judged = None if reference is None else str(reference)
+    judged, first = (None if one is None else str(one) for one in (reference, portfolio))
     file = None if config is None else Path(config)
-    tested, limits = _paths(test), (trials, minutes, budget)
+    tested, limits = _paths(test), (trials, minutes, budget, first)
     asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
@@ -245,6 +246,8 @@ def tune_asked(
     forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
+    if asked.portfolio not in (None, "none"):
+        asked = asked._replace(portfolio=str(Path(asked.portfolio).resolve()))
     folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)
     path, now, more = written(asked, overrides, folder, show)

@@ -61,3 +61,12 @@ def test_of_several_odometries_all_baselines_are_in_the_bank():
     for one in sets.parameters:
         space.check(one)
     assert list(untrained_sets(space, 1).parameters) == space.baselines[:1]
+
+
+def test_a_portfolio_gives_the_members():
+    first = [{**SPACE.baseline, "size": n} for n in (2, 7, 9)]
+    assert untrained_sets(SPACE, 4, first).parameters == (SPACE.baseline, first[0])
+    space = PooledSpace({"first": SPACE, "second": SPACE})
+    of_second = [{ODOMETRY: "second", **one} for one in first]
+    assert list(untrained_sets(space, 4, of_second).parameters) == [*space.baselines, of_second[0]]
+    assert list(untrained_sets(space, 2, of_second).parameters) == space.baselines

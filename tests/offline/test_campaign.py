@@ -10,11 +10,13 @@ import pytest
 from drives import FIRST_STAMP
 from kills import contents
 
+from adaptune import yaml12
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.metrics import window_ends
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import averaged
+from adaptune.odometry.portfolio import read_portfolio
 from offline import campaign
 from offline.campaign import BaselineError, check_baseline
 from offline.config import load_study
@@ -155,6 +157,31 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
     monkeypatch.setattr(Workers, "_spawn", doomed)
     with pytest.raises(WorkerError, match=r"died \(its process was ended by SIGKILL\) on one"):
         train(study)
+
+
+def test_the_sets_of_a_portfolio_recommend_before_the_search_goes_on(study_file, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    base = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+    sets = [base, {**base, "max_correspondence_distance": 1.0}, {**base, "keyframe_interval": 9.0}]
+    data = {"odometry": "fake_odometry:Fake", "sets": [{"parameters": one} for one in sets]}
+    (path := tmp_path / "mine.yaml").write_text(yaml12.dump(data))
+    given = f"offline.portfolio={{{path}: {read_portfolio(str(path)).digest}}}"
+
+    def said(*more):
+        caplog.clear()
+        trials = train(load_study(study_file, [given, *more], tmp_path / "study")).trials
+        return trials, [t for t in caplog.messages if t.startswith("after ")]
+
+    trials, told = said("offline.trials=3")
+    assert [row["proposed by"] for row in trials] == ["baseline", "portfolio", "portfolio"]
+    assert [row["max_correspondence_distance"] for row in trials] == [2.0, 1.0, 2.0]
+    assert told == []  # the verdict says it
+    shutil.rmtree(tmp_path / "study")
+    trials, (told,) = said()
+    assert len(trials) == 10
+    pattern = r"after 3 sets: so far, trial 1 is the best \(.*\), with 0\.\d+ times .* goes on"
+    assert re.fullmatch(pattern, told)
+    assert said("offline.trials=12")[1] == []
 
 
 FEW = ["offline.trials=3", "offline.initial=3", "offline.workers=1"]

@@ -78,3 +78,21 @@ def test_a_finite_pool_is_tried_to_its_end(config, batch):
     config = config.model_copy(update={"batch": batch, "initial": 6})
     history = run(space, config, 30, lambda _: 1.0)
     assert len(history) == len({repr(s) for s, _ in history}) == 23
+
+
+def test_each_odometry_begins_with_the_sets_of_its_portfolio():
+    config = OfflineConfig(batch=8, initial=4, seed=5)
+    of = {"kiss": [{"voxel": 0.5}, {"voxel": 0.7}], "gicp": [{"distance": 2.0, "passes": 9}]}
+    first = [{ODOMETRY: label, **own} for label, sets in of.items() for own in sets]
+    sampler, sets = make_sampler(SPACE, config, first), []
+    sources = []
+    for _ in range(9):
+        found = sampler.propose([], sets)
+        sets.append(found.parameters)
+        sources.append((found.parameters[ODOMETRY], found.source))
+    assert sets[:3] == SPACE.baselines
+    assert [s for s, (_, source) in zip(sets, sources, strict=True) if source == "portfolio"] == [
+        first[2],
+        *first[:2],
+    ]
+    assert [label for label, _ in sources] == ["gicp", "ndt", "kiss"] * 3

@@ -198,3 +198,22 @@ def test_a_sampler_that_cannot_sample_the_parameters_is_refused_at_once():
     with pytest.raises(SamplerError, match="step must be given"):
         make_sampler(SPACE, config)
     assert len(run(config, 4, FINITE, lambda _: 1.0)) == 4
+
+
+@pytest.mark.parametrize("name", ["tpe", "annealing", "optuna.samplers:CmaEsSampler"])
+def test_sets_of_a_portfolio_follow_the_baseline_and_count_as_initial(name):
+    config = OfflineConfig(sampler=name, batch=4, initial=6, seed=5)
+    first = [{**SPACE.baseline, "passes": n} for n in (5, 7)]
+    sampler, sets, sources = make_sampler(SPACE, config, first), [], []
+    for n in range(12):
+        history = [(s, bowl(s)) for s in sets[: max(0, n - 3)]]
+        found = sampler.propose(history, sets[len(history) :])
+        sets.append(found.parameters)
+        sources.append(found.source)
+    assert sets[:3] == [SPACE.baseline, *first]
+    assert sources[:6] == ["baseline", "portfolio", "portfolio", "sobol", "sobol", "sobol"]
+    assert set(sources[6:]) == {name}
+    many = [{**SPACE.baseline, "rings": n} for n in range(1, 9)]
+    sampler = make_sampler(SPACE, config, many)
+    history = [(s, bowl(s)) for s in [SPACE.baseline, *many[:7]]]
+    assert sampler.propose(history) == (many[7], "portfolio")

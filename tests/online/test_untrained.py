@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from commands import refused, succeeded
 
-from adaptune import manifest
+from adaptune import manifest, yaml12
+from adaptune.odometry.portfolio import read_portfolio
 from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.study.driven import ModeError
 from offline.config import load_study
@@ -181,3 +182,13 @@ def test_the_command_line_names_what_follows(study_file, tmp_path):
     assert "adaptune offline" in done.stdout.splitlines()[-1]
     said = refused("compare", *words, "-o", BLIND)
     assert "run `adaptune online --untrained` with this study, which" in said
+
+
+def test_members_are_the_first_of_the_portfolio(load, tmp_path):
+    base = load().odometry.space.baseline
+    sets = [base, *({**base, "keyframe_interval": x} for x in (2.0, 4.0, 8.0))]
+    data = {"odometry": "fake_odometry:Fake", "sets": [{"parameters": one} for one in sets]}
+    (path := tmp_path / "mine.yaml").write_text(yaml12.dump(data))
+    given = f"offline.portfolio={{{path}: {read_portfolio(str(path)).digest}}}"
+    mode = ReplaySetup.of(load(given)).mode("untrained")
+    assert list(mode.sets.values()) == sets[:2]

@@ -467,3 +467,38 @@ def test_what_is_new_goes_where_its_folder_belongs(tmp_path):
     text = path.read_text()
     assert text.startswith("# mine\n")
     assert "health:  # a robot's\n  # m/s: twice" in text
+
+
+PORTFOLIO = """\
+odometry: fake_odometry:Fake
+sets:
+- parameters: {max_correspondence_distance: 4.0, keyframe_interval: 4.0}
+- parameters: {max_correspondence_distance: 1.0, keyframe_interval: 4.0}
+scans: {rate: [1.0, 2.0], points: [1000, 9000], view: [360, 360]}
+"""
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_study_keeps_the_portfolio_that_it_began_with(bag, tmp_path, caplog):
+    (tmp_path / "mine.yaml").write_text(PORTFOLIO)
+    failed(bag, *FAKE, "--portfolio", "mine.yaml", "--folder", "out")
+    what = "its scans are unlike those that the portfolio of fake_odometry:Fake was chosen on"
+    assert f"one: {what}: rate 10 (it was chosen on 1 to 2)" in caplog.text
+    study = study_in("out/out.yaml")
+    assert list(study.config.offline.portfolio) == [str(tmp_path / "mine.yaml")]
+    assert [one["max_correspondence_distance"] for one in study.portfolio] == [1.0]
+    again = failed(bag, *FAKE, "--folder", "out")
+    assert "another `adaptune tune` made it: --portfolio" in again
+    failed(bag, *FAKE, "--portfolio", "none", "--folder", "without")
+    assert study_in("without/without.yaml").portfolio == ()
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_portfolio_that_cannot_be_used_is_refused_at_once(bag, tmp_path):
+    (file := tmp_path / "mine.yaml").write_text(PORTFOLIO.replace("sets:", "set:"))
+    said = failed(bag, *FAKE, "--portfolio", "mine.yaml")
+    assert f"{file}, line 2: set: unknown key; did you mean 'sets'?" in said
+    file.write_text(PORTFOLIO)
+    said = failed(bag, "--odometry", "kiss_icp", "--portfolio", file)
+    assert f"{file}: odometry: is of fake_odometry:Fake, and tuned is kiss_icp" in said
+    assert f"{tmp_path}/no.yaml: there is no such file" in failed(bag, "--portfolio", "no.yaml")
