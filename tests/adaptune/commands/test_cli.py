@@ -103,7 +103,7 @@ def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words,
     assert words in said
 
 
-MOST_COMMANDS = 13
+MOST_COMMANDS = 14
 
 
 def test_help_and_version(adaptune):
