@@ -40,7 +40,7 @@ class Told(NamedTuple):
     error: float  # percent of the way over the last metres; NaN if nothing was measured
     low: float  # ends of the 95 % interval
     high: float
-    restarts: int  # how often its motion was none of a platform's, or it gave no pose
+    restarts: int  # how often its motion was none of a platform's
 
 
 class Watch:
@@ -57,16 +57,17 @@ class Watch:
         self._periods, self._starts = Periods(1e9), 0
         self._T = np.eye(4)  # the motion to the scan before
         self._last: tuple[int, Poses] | None = None
-        self._first = 0
+        self._first: int | None = None
 
     def see(self, scan: Scan, T_odom_sensor: Poses) -> Told | None:
         """See a scan and its pose, of shape (4, 4), NaN if there is none; tell once a second."""
         self._evidence.observe(scan.stamp, scan, Motions(self._T, {}, self._starts))
+        self._first = scan.stamp if self._first is None else self._first
         known = bool(np.isfinite(T_odom_sensor).all())
-        if self._last is None:
-            self._first, self._T = scan.stamp, np.eye(4)
-        elif not known:
+        if not known:
             self._T = np.full((4, 4), np.nan)
+        elif self._last is None:
+            self._T = np.eye(4)
         else:
             # Over the scans without a pose, too.
             before, T_before = self._last
@@ -75,7 +76,7 @@ class Watch:
                 self._starts += 1
                 T_healthy, T_step = self._guard.go_on(elapsed)
                 self._T = T_healthy @ T_step
-        if known or self._last is None:
+        if known:
             self._last = scan.stamp, np.array(T_odom_sensor)
         if not self._periods.due(scan.stamp):
             return None

@@ -38,6 +38,13 @@ def test_what_stands_still_is_not_to_be_relied_on():
     assert "first at" in first
 
 
+def test_one_that_begins_late_is_lost_and_then_good():
+    told = watched(lambda T, i: T if i > 25 else np.full((4, 4), np.nan), n=90)
+    assert (told[2].state, told[2].why) == ("lost", "no pose for 2.0 s")
+    assert told[-1].state == "good"
+    assert told[-1].restarts == 0
+
+
 def test_a_lost_cloud_is_no_failure():
     told = watched(lambda T, i: T if i % 10 != 5 else np.full((4, 4), np.nan))
     assert [one.state for one in told[2:]] == ["good"] * 5
