@@ -23,6 +23,8 @@ OFF, OFF_SHARE = 0.25, 0.05
 several times what registrations are wrong by, and half of a jump that matters."""
 OFF_ANGLE = 0.07
 """Radians by which it may differ."""
+BETTER = 0.05
+"""By how much more of the points have to lie near each other for another motion to be believed."""
 FEWER, NEARER = 0.7, 0.5
 """Shares of the usual number of points, and of their median range, below which a scan is odd: the
 sensor is covered, or data are lost."""
@@ -122,6 +124,8 @@ class HealthMonitor:
             self._steps.append(_Step(seconds, False))
             return
         best = max(found, key=lambda hop: hop.inliers)
+        # Where a place repeats itself, another motion looks as well.
+        best = found[0] if best.inliers < found[0].inliers + BETTER else best
         self._measured = best.T_start_end, took
         self._steps.append(_Step(seconds, True, _contradicts(T, best, took), _is_known(T, best)))
 

@@ -12,7 +12,7 @@ from adaptune.recording.scan import Scan
 from adaptune.study.config import SteerConfig
 from online.watch import Watch, in_words, watch_topics
 
-STEP = 0.3
+STEP = 0.15
 
 
 def watched(wrong=lambda T, _: T, n=70):
