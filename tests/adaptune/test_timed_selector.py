@@ -1,8 +1,6 @@
 import logging
-import re
 import threading
 from dataclasses import replace
-from pathlib import Path
 
 import drives
 import numpy as np
@@ -18,7 +16,6 @@ from adaptune.selector import Periods, Selector, TimedSelector, UntrainedSelecto
 from adaptune.space import ParameterSets, Selection
 
 SCAN = Scan(0, np.zeros((0, 3), np.float32))
-GUIDE = Path(__file__).parents[2] / "docs/adapting-live.md"
 
 
 def moved(metres):
@@ -134,19 +131,13 @@ def test_falls_back_to_the_fixed_set_or_to_members_that_never_rest(members, rese
     assert not any(untrained.weights.values())
 
 
-def test_the_guide_s_example(tmp_path, monkeypatch, caplog):
-    blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL)
-    (example,) = [block for block in blocks if "TimedSelector(" in block]
-    monkeypatch.chdir(tmp_path)
+def test_a_loop_in_a_thread_of_its_own(caplog):
     space, model = KeyframeGicp.space, random_model()
     of_gicp = tuple(space.from_unit(np.random.default_rng(0).random((6, 4))))
     model = replace(model, sets=ParameterSets(space, model.sets.trials, of_gicp))
-    Path("runs/my").mkdir(parents=True)
-    replace(model, bank=[], vectors=np.zeros((0, 0, 3), np.float32)).save(
-        Path("runs/my/model.safetensors")
+    timed = TimedSelector(
+        Selector(replace(model, bank=[], vectors=np.zeros((0, 0, 3), np.float32)))
     )
-    names = {}
-    exec(example, names)
     odometry = InProcess(KeyframeGicp(model.sets[model.fixed]))
     first, *scans = [Scan(stamp, points) for stamp, points, _ in drives.scans(n_scans=25)]
     odometry.start(odometry.prepare(first), np.eye(4))
@@ -154,7 +145,7 @@ def test_the_guide_s_example(tmp_path, monkeypatch, caplog):
 
     def drive():
         for scan in scans:
-            selection = names["timed"].update(scan.stamp, scan, odometry.motions)
+            selection = timed.update(scan.stamp, scan, odometry.motions)
             if selection is not None:
                 odometry.apply(selection)
             poses.append(odometry.register(odometry.prepare(scan)).T_odom_sensor)
