@@ -1,6 +1,7 @@
 """The command that watches an odometry of somebody else's."""
 
 import logging
+import math
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -10,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from adaptune.commands.evaluate import Place
-from adaptune.commands.online import Ros2
 from adaptune.commands.terminal import Points, progress, say
 from adaptune.errors import AdaptuneError
 
@@ -28,6 +28,7 @@ Poses = Annotated[
 Length = Annotated[float, typer.Option(metavar="METRES", help="What errors are told over.")]
 Table = Annotated[Path, typer.Option(help="The table, CSV: a row a second.", dir_okay=False)]
 Ros = Annotated[bool, typer.Option("--ros", help="Listen on a robot with ROS 1.")]
+Ros2 = Annotated[bool, typer.Option("--ros2", help="Listen on a robot with ROS 2.")]
 
 
 def watch(
@@ -51,6 +52,8 @@ def watch(
     by, told = convention(extrinsic, 0.0, "stamp"), list["Told"]()
     if [bag is not None, ros, ros2].count(True) != 1:
         raise AdaptuneError("name a bag, or listen on a robot with --ros or --ros2")
+    if not 0.0 < sub_trajectory < math.inf:
+        raise AdaptuneError("--sub-trajectory: give metres, more than 0")
     with progress() as show:
         if bag is not None:
             told += _along(bag, odometry, points, sub_trajectory, by, show)

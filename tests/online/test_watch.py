@@ -73,6 +73,7 @@ def test_the_command_watches_along_a_bag(bag):
         (["a.bag", "--odometry", "/odom", "--ros2"], "name a bag, or listen on a robot"),
         (["a.bag", "--odometry", "/nobody"], "/nobody"),
         (["--ros2", "--odometry", "/odom"], "--points: name the topic"),
+        (["a.bag", "--odometry", "/truth", "--sub-trajectory", "-3"], "more than 0"),
         (["--ros2", "--points", "/p", "--odometry", "my odom"], "--odometry my odom: "),
     ],
 )
