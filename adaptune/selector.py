@@ -29,6 +29,7 @@ from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import (
+    IN_DOUBT,
     ODOMETRY,
     ParameterSet,
     ParameterSets,
@@ -338,7 +339,7 @@ class Selector(_Measuring):
         is_worse = error is not None and error.low > MAX_TIMES_PREDICTED * predicted
         # A fixed set is not left because a place is new alone.
         is_new = not self._stands_by and self._is_new()
-        if is_new or is_worse or self._failed or self._live.health.state in {"doubtful", "lost"}:
+        if is_new or is_worse or self._failed or self._live.health.state in IN_DOUBT:
             self._all_work_until = seconds + REMEMBERED
         # Somebody has to go on.
         present = self._live.present()[np.isin(self.members, self._always)]

@@ -484,6 +484,8 @@ def load_space(data: Mapping[str, Any]) -> ParameterSpace:
 
 State = Literal["unknown", "good", "doubtful", "lost"]
 """Whether to believe a pose."""
+IN_DOUBT: frozenset[State] = frozenset({"doubtful", "lost"})
+"""States in which something speaks against it."""
 
 
 class Selection(NamedTuple):
@@ -539,4 +541,4 @@ class Selection(NamedTuple):
     @property
     def in_doubt(self) -> bool:
         """Whether something speaks against the pose."""
-        return self.state in {"doubtful", "lost"}
+        return self.state in IN_DOUBT

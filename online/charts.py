@@ -21,6 +21,7 @@ from adaptune.report.charts import (
     Words,
     shares,
 )
+from adaptune.space import IN_DOUBT
 from online.modes import BASELINE, FIXED, WITHOUT_MODEL
 from online.record import switched
 from online.replayed import ModeReplay, ReplayedSequence
@@ -143,7 +144,7 @@ def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Pane
 
 
 def _in_doubt(track: ModeReplay) -> NDArray[np.bool_]:
-    return np.isin(track.states, ("doubtful", "lost"))
+    return np.isin(track.states, list(IN_DOUBT))
 
 
 def choice_chart(replayed: ReplayedSequence) -> Chart | None:

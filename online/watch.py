@@ -2,11 +2,11 @@
 
 import csv
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,13 +47,12 @@ class Watch:
     """Watches an odometry by its poses and the scans, and steers nothing.
 
     Show it every scan with its pose. Once a second, `see` tells what is known; it takes some tens
-    of milliseconds then. An error is that over `length` metres. `health` bounds the platform's
-    motion.
+    of milliseconds then. An error is that over `length` metres.
     """
 
-    def __init__(self, length: float = 25.0, health: HealthCheck | None = None):
+    def __init__(self, length: float = 25.0):
         self._evidence = LiveEvidence((), length, WINDOW)
-        self._guard = Guard(health or HealthCheck())
+        self._guard = Guard(HealthCheck())
         self._periods, self._starts = Periods(1e9), 0
         self._T = np.eye(4)  # the motion to the scan before
         self._last: tuple[int, Poses] | None = None
@@ -128,7 +127,7 @@ def _shown(told: Told) -> tuple[int, str, dict[str, str]]:
     return LEVELS[told.state], told.why or told.state, values
 
 
-def write_told(path: Path, told: Iterator[Told] | list[Told]) -> None:
+def write_told(path: Path, told: Iterable[Told]) -> None:
     """Write what was told as CSV."""
     from adaptune.files import replacing
 
@@ -143,11 +142,12 @@ def in_words(told: list[Told]) -> list[str]:
         return ["Too short to tell: give two seconds of scans at least."]
     spans = [(one, after.seconds - one.seconds) for one, after in pairwise(told)]
     total = told[-1].seconds - told[0].seconds
-    known: dict[Any, float] = {}
+    known: dict[State, float] = {}
     for one, seconds in spans:
         known[one.state] = known.get(one.state, 0.0) + seconds
     said = []
-    for state, first in (("lost", "Do not rely on it"), ("doubtful", "Look at it")):
+    begins: dict[State, str] = {"lost": "Do not rely on it", "doubtful": "Look at it"}
+    for state, first in begins.items():
         if seconds := known.get(state, 0.0):
             begin = next(one for one, _ in spans if one.state == state)
             what = f"{first}: it is {state} for {seconds:.0f} s of {total:.0f}"

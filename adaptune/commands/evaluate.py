@@ -50,12 +50,8 @@ def evaluate(
 
     limit = None if most is None else percent(most, "max")
     bags, named = parted(words)
-    of_poses = {"extrinsic": extrinsic, "clock_offset": clock_offset, "pose_time": pose_time}
-    given: dict[str, Any] = {
-        "reference": reference,
-        "points": points,
-        "reading": reading,
-    } | of_poses
+    given: dict[str, Any] = {"reference": reference, "points": points, "reading": reading}
+    given |= {"extrinsic": extrinsic, "clock_offset": clock_offset, "pose_time": pose_time}
     with progress() as show:
         found = evaluated(
             bags, *named, sub_trajectory=sub_trajectory, out=out, progress=show, **given

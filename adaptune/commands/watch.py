@@ -54,14 +54,17 @@ def watch(
         raise AdaptuneError("name a bag, or listen on a robot with --ros or --ros2")
     if not 0.0 < sub_trajectory < math.inf:
         raise AdaptuneError("--sub-trajectory: give metres, more than 0")
-    with progress() as show:
-        if bag is not None:
-            told += _along(bag, odometry, points, sub_trajectory, by, show)
-        elif points is None:
-            raise AdaptuneError("--points: name the topic of the scans on the robot")
-        else:
-            _on_robot(odometry, points, sub_trajectory, by, show, told, ros2=ros2)
-    write_told(out, told)
+    try:
+        with progress() as show:
+            if bag is not None:
+                told += _along(bag, odometry, points, sub_trajectory, by, show)
+            elif points is None:
+                raise AdaptuneError("--points: name the topic of the scans on the robot")
+            else:
+                _on_robot(odometry, points, sub_trajectory, by, show, told, ros2=ros2)
+    finally:  # what was told is kept, whatever ends it
+        if told:
+            write_told(out, told)
     for sentence in (*in_words(told), f"A row a second: {out}"):
         say(sentence)
 
@@ -106,9 +109,11 @@ def _on_robot(
 
     def tell(one: "Told") -> None:
         if told and told[-1].state != one.state:
-            log.warning("%s is %s at %.1f s: %s", odometry, one.state, one.seconds, one.why)
+            why = f": {one.why}" if one.why else ""
+            log.warning("%s is %s at %.1f s%s", odometry, one.state, one.seconds, why)
         told.append(one)
-        show("watching", len(told), len(told), f"{one.state}, error {one.error:.2f} %")
+        error = f", error {one.error:.2f} %" if math.isfinite(one.error) else ""
+        show("watching", len(told), len(told), one.state + error)
 
     place = tuple(map(tuple, by.T_body_sensor.tolist()))
     try:

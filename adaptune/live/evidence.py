@@ -26,7 +26,7 @@ from adaptune.live.monitor import HOPS_TO_BE_LOST, Health, HealthMonitor
 from adaptune.live.own_error import CONTRADICTED, FAMILIAR, OWN_SECONDS, Link, OwnError, OwnErrors
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
-from adaptune.space import Selection
+from adaptune.space import IN_DOUBT, Selection
 
 SPACING = 1.0  # metres between scans that may be the start or the end of a hop
 LOST = 10.0
@@ -97,7 +97,6 @@ class LiveEvidence:
         self._short = self._since = self._n_starts = 0
         self._restarted = 0  # stamp of the scan of the last restart
         self._monitor = HealthMonitor()
-        self._rejected = 0  # hops in a row
         self._begin()
 
     def forget(self) -> None:
@@ -105,6 +104,7 @@ class LiveEvidence:
         self._begin()
 
     def _begin(self) -> None:
+        self._rejected = 0  # hops in a row, which a restart does not excuse
         self._forget_errors()
         self._own = OwnErrors(self._length, seconds=self._seconds)
         self._anchors: deque[_Anchor] = deque()
@@ -127,7 +127,7 @@ class LiveEvidence:
         have yet to reach over a sub-trajectory, and after `SELDOM` scans.
         """
         unknown = not len(self._hops.errors) or self._rejected or self._wrong.any()
-        in_doubt = in_doubt or self.health.state in {"doubtful", "lost"}
+        in_doubt = in_doubt or self.health.state in IN_DOUBT
         if in_doubt or unknown or self._since >= SELDOM:
             return True
         behind = 0.0 if self._newest is None else self._newest.metres - self._measured

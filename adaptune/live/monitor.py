@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert, rotation_angle, scale
+from adaptune.geometry import Poses, invert, rotation_angle, scale, squared_ranges
 from adaptune.live.hops import NEW_GUESS, Hop, HopCloud, apart, register
 from adaptune.recording.scan import Scan
 from adaptune.space import State
@@ -30,6 +30,8 @@ FEWER, NEARER = 0.7, 0.5
 sensor is covered, or data are lost."""
 USUAL_SCANS, ODD_SECONDS = 15, 10.0
 """Scans whose median is usual; what stays odd for longer is usual, too."""
+KEPT_STEPS = 30
+"""Registrations that are remembered."""
 USUALLY, LEAST_STEPS = 0.8, 5
 """Share of so many registrations that were accepted from which one that is not means something."""
 STARTS, STARTS_SECONDS = 3, 10.0
@@ -65,23 +67,22 @@ class HealthMonitor:
         self._sizes: deque[tuple[int, float]] = deque(maxlen=USUAL_SCANS)
         self._odd: tuple[float, str] | None = None  # since when, and what
         self._odd_until = -np.inf
-        self._steps: deque[_Step] = deque(maxlen=30)
+        self._steps: deque[_Step] = deque(maxlen=KEPT_STEPS)
         self._starts: deque[float] = deque(maxlen=STARTS)
         self._begin: tuple[float, HopCloud] | None = None
         self.begun = False  # whether the next call of `measure` ends what this one began
         self._T_begin_now = np.eye(4)
         self._measured: tuple[Poses, float] | None = None  # the last second's motion
-        self._now = self._posed = self._period = 0.0
-        self._first = np.inf
+        self._now = self._posed = -np.inf
+        self._period = 0.0  # seconds between the last scans
 
     def see(self, seconds: float, scan: Scan) -> None:
         """See the newest scan."""
-        self._period = max(0.0, seconds - self._now) if np.isfinite(self._first) else 0.0
-        if not np.isfinite(self._first):
-            self._first = self._posed = seconds
-        self._now = seconds
+        if np.isinf(self._now):
+            self._now = self._posed = seconds
+        self._period, self._now = max(0.0, seconds - self._now), seconds
         points = scan.points[::10]
-        reach = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+        reach = float(np.sqrt(np.median(squared_ranges(points)))) if len(points) else 0.0
         usual = np.median(self._sizes, axis=0) if len(self._sizes) == USUAL_SCANS else (0, 0.0)
         odd = ""
         if len(scan) < FEWER * usual[0]:

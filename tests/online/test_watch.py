@@ -66,6 +66,26 @@ def test_the_command_watches_along_a_bag(bag):
     assert float(rows[-1]["seconds"]) > 2.0
 
 
+def test_what_was_told_is_kept_where_the_robot_goes_away(bag, monkeypatch):
+    played = iter(drives.scans(4, 30))
+
+    def messages():
+        for stamp, points, T in played:
+            yield "/odom", local_link.odometry(stamp, T)
+            yield "/points", local_link.cloud(stamp, points)
+        link.alive = False
+
+    link = local_link.LocalLink(messages())
+    link.close = lambda: None
+    monkeypatch.setattr("adaptune.ros.ros2.local_ros2", lambda: link)
+    monkeypatch.setattr("online.live.SILENCE", 0.1)
+    result = CliRunner().invoke(
+        app, ["watch", "--ros2", "--points", "/points", "--odometry", "/odom"]
+    )
+    assert "adaptune's node in ROS has ended" in str(result.exception) + result.output
+    assert list(csv.DictReader((bag.parent / "watch.csv").open()))
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
