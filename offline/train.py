@@ -178,8 +178,11 @@ def _say_so_far(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Ve
     """Say what the sets of the portfolio recommend, before others are tried."""
     tried = tuple(verdict.parameters for verdict in verdicts.values())
     sets = ParameterSets(study.odometry.space, tuple(verdicts), tried)
-    data = labelled_data(study, archive, sets).usable()
-    _log.info("after %d sets: %s; the search goes on", len(tried), in_short(data))
+    try:
+        said = in_short(labelled_data(study, archive, sets).usable())
+    except AdaptuneError as why:  # what follows may be usable, or within the budget
+        said = f"so far, none can be recommended ({why})"
+    _log.info("after %d sets: %s; the search goes on", len(tried), said)
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:

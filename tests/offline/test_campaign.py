@@ -10,6 +10,7 @@ import pytest
 from drives import FIRST_STAMP
 from kills import contents
 
+import offline.train
 from adaptune import yaml12
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError, Finding
@@ -159,7 +160,9 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
         train(study)
 
 
-def test_the_sets_of_a_portfolio_recommend_before_the_search_goes_on(study_file, tmp_path, caplog):
+def test_the_sets_of_a_portfolio_recommend_before_the_search_goes_on(
+    study_file, tmp_path, caplog, monkeypatch
+):
     caplog.set_level(logging.INFO)
     base = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
     sets = [base, {**base, "max_correspondence_distance": 1.0}, {**base, "keyframe_interval": 9.0}]
@@ -182,6 +185,15 @@ def test_the_sets_of_a_portfolio_recommend_before_the_search_goes_on(study_file,
     pattern = r"after 3 sets: so far, trial 1 is the best \(.*\), with 0\.\d+ times .* goes on"
     assert re.fullmatch(pattern, told)
     assert said("offline.trials=12")[1] == []
+
+    def none(_):
+        raise AdaptuneError("less than the cheapest takes")
+
+    shutil.rmtree(tmp_path / "study")
+    monkeypatch.setattr(offline.train, "in_short", none)
+    trials, (told,) = said()
+    assert len(trials) == 10
+    assert "none can be recommended (less than the cheapest takes); the search goes on" in told
 
 
 FEW = ["offline.trials=3", "offline.initial=3", "offline.workers=1"]
