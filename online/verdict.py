@@ -191,7 +191,9 @@ def _gained(
     ratio = _to_baseline(best)
     sure = f"That is {ratio.value:.2f} times the error ({_interval(ratio)}; {where})"
     if own is not None and own["low"] is not None:
-        sure += f"; on another drive, expect {_end(own['low'])} to {_end(own['high'])} times"
+        worse = ", so perhaps more" * (own["low"] < 1.0 < own["high"])
+        ends = f"{_end(own['low'])} to {_end(own['high'])}"
+        sure += f"; on another drive, expect {ends} times{worse}"
     return [f"{said}.", f"{sure}."]
 
 
@@ -274,6 +276,8 @@ def _controls(rows: Sequence[ComparisonRow]) -> list[str]:
     has += f" ({_interval(ratio)})"
     if main.cpu_ms is not None and cost is not None:
         has += f", at {main.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
+    if ratio.interval is not None and ratio.interval[1] >= 1.0:
+        has += ": what it gains is the mean of several sets; weighing them gains nothing sure"
     return [f"{has}."]
 
 

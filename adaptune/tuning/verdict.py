@@ -40,7 +40,8 @@ def front_table(
     said = [
         "Another drive: the error there, in times that of the odometry's own parameters, 95 %.",
         _of_training(rows) if any("*" in cell["choice"] for cell in cells) else "",
-        f"RTE: mean error of the parts of the path that are {metres} long. Files: {study.folder}.",
+        f"RTE: mean error of the parts of the path that are {metres} long. Cost: CPU time a scan.",
+        f"Files: {study.folder}.",
     ]
     own = None if study.fixed is None else study.own_file(study.fixed)
     if own is not None and own[0].exists():
