@@ -94,6 +94,7 @@ def choices(
         modes += [FIXED] * ("within the budget" in row["what"])
         told |= {*modes}
         found.append(dict(row) | {"what": row["what"].split(", ")[0], "mode": "", _ON: "training"})
+        found[-1] |= {"in training": (row[_ERROR], row[_COST])}
         found[-1] |= next((_driven(last[mode]) for mode in modes if mode in last), {})
         found[-1]["recommended"] = best in modes
     for mode, (what, file) in _ALONE.items():
@@ -190,7 +191,9 @@ def _gained(
     ratio = _to_baseline(best)
     sure = f"That is {ratio.value:.2f} times the error ({_interval(ratio)}; {where})"
     if own is not None and own["low"] is not None:
-        sure += f"; on another drive, expect {_end(own['low'])} to {_end(own['high'])} times"
+        worse = ", so perhaps more" * (own["low"] < 1.0 < own["high"])
+        ends = f"{_end(own['low'])} to {_end(own['high'])}"
+        sure += f"; on another drive, expect {ends} times{worse}"
     return [f"{said}.", f"{sure}."]
 
 
@@ -273,6 +276,8 @@ def _controls(rows: Sequence[ComparisonRow]) -> list[str]:
     has += f" ({_interval(ratio)})"
     if main.cpu_ms is not None and cost is not None:
         has += f", at {main.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
+    if ratio.interval is not None and ratio.interval[1] >= 1.0:
+        has += ": what it gains is the mean of several sets; weighing them gains nothing sure"
     return [f"{has}."]
 
 

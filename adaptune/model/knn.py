@@ -1,13 +1,14 @@
 """The published selection: k nearest neighbours over descriptors, by their principal components."""
 
 from collections.abc import Iterable
-from typing import Self
+from operator import itemgetter
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from sklearn.decomposition import PCA
 
-from adaptune.compiled import compiled
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import NOTHING, Live, Rule, TrainingData
 from adaptune.space import Selection
@@ -87,36 +88,32 @@ class NearestNeighbours(Rule):
         self._allowed = data.allows()
         unit = data.sets.unit
         sets = unit / (float(unit.std(axis=0).mean()) or 1.0)
-        self._errors = np.ascontiguousarray(np.minimum(data.errors, np.float32(FAILURE)))
-        # Frames that have seen the same sets lie together, usually those of a sequence, each
-        # group's in their order.
+        self._errors = np.minimum(data.errors, np.float32(FAILURE))
+        # Frames that have seen the same sets are a group, usually those of a sequence.
         seen = ~np.isnan(self._errors)
         patterns: dict[bytes, list[int]] = {}
         for frame, pattern in enumerate(np.packbits(seen, axis=1)):
             patterns.setdefault(pattern.tobytes(), []).append(frame)
-        groups = [frames for frames in patterns.values() if seen[frames[0]].any()]
-        self._frames = np.concatenate(groups)
-        self._bounds = np.cumsum([0, *map(len, groups)])
-        self._features = data.features[self._frames]
-        seen_sets = [np.flatnonzero(seen[frames[0]]) for frames in groups]
-        self._near_squared, self._near_sets = _nearest_sets(sets, seen_sets, self.k)
+        self._groups = [
+            _Group(np.array(frames), *_nearest(sets, np.flatnonzero(seen[frames[0]]), self.k))
+            for frames in patterns.values()
+            if seen[frames[0]].any()
+        ]
         return self
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predicted error of every set in percent; infinite for those that may not be chosen."""
-        near = _nearest_of_groups(self._features, self._bounds, feature, self.k)
-        squared, frames, group = near[0], self._frames[near[1]], near[2]
+        of_frames = cdist(self.data_.features, feature[None], "sqeuclidean")[:, 0]
+        near = []
+        for group in self._groups:
+            frames = group.frames[np.argsort(of_frames[group.frames], kind="stable")[: self.k]]
+            near += [(of_frames[frame], frame, group) for frame in frames]
         # Of equally near frames the earlier one first, whatever group it is of.
-        order = np.lexsort((frames, squared))
-        predicted = _mean_of_nearest(
-            squared[order],
-            frames[order],
-            group[order],
-            self._near_squared,
-            self._near_sets,
-            self._errors,
-            self.k,
-        )
+        near.sort(key=itemgetter(0, 1))
+        squared = np.hstack([distance + group.squared for distance, _, group in near])
+        errors = np.hstack([self._errors[frame, group.sets] for _, frame, group in near])
+        nearest = np.argsort(squared, axis=1, kind="stable")[:, : self.k]
+        predicted = np.take_along_axis(errors, nearest, axis=1).mean(axis=1, dtype=np.float64)
         return np.where(self._allowed, predicted, np.inf)
 
     def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:  # noqa: ARG002
@@ -132,99 +129,18 @@ class NearestNeighbours(Rule):
         )
 
 
-def _nearest_sets(
-    sets: NDArray[np.float64], seen: list[NDArray[np.intp]], k: int
+class _Group(NamedTuple):
+    """Frames that have seen the same sets, and of these the nearest to each set."""
+
+    frames: NDArray[np.intp]  # (n_frames,)
+    squared: NDArray[np.float64]  # (n_sets, n_near): squared distances, rising
+    sets: NDArray[np.intp]  # (n_sets, n_near)
+
+
+def _nearest(
+    sets: NDArray[np.float64], seen: NDArray[np.intp], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """For each group of frames and each set, the nearest of the sets that the group has seen.
-
-    Squared distances, infinite where it has seen fewer, and sets; of shape (n_groups, n_sets, k).
-    """
-    squared = np.zeros((len(sets), len(sets)))
-    for p in range(sets.shape[1]):
-        squared += (sets[:, p, None] - sets[:, p]) ** 2
-    near_squared = np.full((len(seen), len(sets), min(k, len(sets))), np.inf)
-    near_sets = np.zeros(near_squared.shape, np.intp)
-    for g, of_group in enumerate(seen):
-        order = np.argsort(squared[:, of_group], axis=1, kind="stable")[:, :k]
-        n = order.shape[1]
-        near_squared[g, :, :n] = np.take_along_axis(squared[:, of_group], order, axis=1)
-        near_sets[g, :, :n] = of_group[order]
-    return near_squared, near_sets
-
-
-@compiled
-def _nearest_of_groups(
-    X: NDArray[np.float64], bounds: NDArray[np.intp], x: NDArray[np.float64], k: int
-) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """The `k` rows of every group that are nearest to `x`: their squared distances, and groups.
-
-    Group g is rows bounds[g] to bounds[g + 1]. In each, distances rise, and of equal ones the
-    earlier row comes first.
-    """
-    n_groups = len(bounds) - 1
-    squared = np.empty(n_groups * k)
-    rows = np.empty(n_groups * k, np.intp)
-    group = np.empty(n_groups * k, np.intp)
-    first = 0
-    for g in range(n_groups):
-        last = first + min(k, bounds[g + 1] - bounds[g])
-        end = first
-        for row in range(bounds[g], bounds[g + 1]):
-            distance = 0.0
-            for f in range(X.shape[1]):
-                difference = X[row, f] - x[f]
-                distance += difference * difference
-            if end == last:
-                if not distance < squared[last - 1]:
-                    continue
-            else:
-                end += 1
-            at = end - 1
-            while at > first and distance < squared[at - 1]:
-                squared[at], rows[at] = squared[at - 1], rows[at - 1]
-                at -= 1
-            squared[at], rows[at] = distance, row
-        group[first:last] = g
-        first = last
-    return squared[:first], rows[:first], group[:first]
-
-
-@compiled
-def _mean_of_nearest(
-    squared: NDArray[np.float64],
-    frames: NDArray[np.intp],
-    group: NDArray[np.intp],
-    near_squared: NDArray[np.float64],
-    near_sets: NDArray[np.intp],
-    y: NDArray[np.floating],
-    k: int,
-) -> NDArray[np.float64]:
-    """Mean target of the `k` nearest pairs, for every candidate.
-
-    Near frames (n,) and near sets (n_groups, n_candidates, n_near) come by rising distance; `y` is
-    of shape (n_frames, n_sets).
-    """
-    n_candidates, n_near = near_sets.shape[1:]
-    means = np.empty(n_candidates)
-    best = np.empty(k)
-    target = np.empty(k)
-    for c in range(n_candidates):
-        n = 0
-        for i in range(len(frames)):
-            if n == k and squared[i] >= best[k - 1]:
-                break
-            g = group[i]
-            for j in range(n_near):
-                distance = squared[i] + near_squared[g, c, j]
-                # Neither is there anything nearer with this frame.
-                if distance == np.inf or (n == k and distance >= best[k - 1]):
-                    break
-                if n < k:
-                    n += 1
-                at = n - 1
-                while at > 0 and distance < best[at - 1]:
-                    best[at], target[at] = best[at - 1], target[at - 1]
-                    at -= 1
-                best[at], target[at] = distance, y[frames[i], near_sets[g, c, j]]
-        means[c] = target[:n].sum() / n
-    return means
+    """Of the sets that were seen, the `k` nearest to each, and their squared distances."""
+    squared = cdist(sets, sets[seen], "sqeuclidean")
+    order = np.argsort(squared, axis=1, kind="stable")[:, :k]
+    return np.take_along_axis(squared, order, axis=1), seen[order]

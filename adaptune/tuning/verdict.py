@@ -39,8 +39,9 @@ def front_table(
         cells.append(cell | {"parameters": row["parameters"]})
     said = [
         "Another drive: the error there, in times that of the odometry's own parameters, 95 %.",
-        "* Error and cost are of training." * any("*" in cell["choice"] for cell in cells),
-        f"RTE: mean error of the parts of the path that are {metres} long. Files: {study.folder}.",
+        _of_training(rows) if any("*" in cell["choice"] for cell in cells) else "",
+        f"RTE: mean error of the parts of the path that are {metres} long. Cost: CPU time a scan.",
+        f"Files: {study.folder}.",
     ]
     own = None if study.fixed is None else study.own_file(study.fixed)
     if own is not None and own[0].exists():
@@ -50,6 +51,13 @@ def front_table(
             f"The bank, on a robot: `adaptune online {study.folder} --ros2 --mode adaptive`."
         )
     return Listing(f"{title} over {metres}", cells, " ".join(filter(None, said)))
+
+
+def _of_training(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Which rows are of training, and what the odometry's own parameters have there."""
+    known = (row["in training"] for row in rows if row["what"] == OWN and "in training" in row)
+    there = (f", where own parameters have {error:.3g} % at {ms:.1f} ms" for error, ms in known)
+    return f"* Error and cost are of training{next(there, '')}."
 
 
 def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:

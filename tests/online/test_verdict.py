@@ -86,6 +86,9 @@ def test_what_to_drive_and_what_adapting_adds():
         "With cores to spare: adaptive, 0.80 times the fixed set's error (95 % interval 0.78 to "
         "0.82), for 1.0 times the CPU time.",
     ]
+    wide = [row | {"high": 1.35} for row in front()]
+    expected = said_of(every(adaptive=0.8), of_training=wide)[1]
+    assert expected.endswith("expect 0.30 to 1.35 times, so perhaps more.")
 
 
 def test_a_bank_that_gains_nothing_is_not_offered():
@@ -195,6 +198,8 @@ def test_a_bank_is_compared_with_even_weights_in_error_and_cost():
         "`adaptive` has 0.90 times the error of the same bank with even weights (95 % interval "
         "0.80 to 0.99), at 20.0 ms of CPU time a scan against 18.0."
     ) in remarks(rows)
+    rows = [replace(row, against={"even": Ratio(1.03, (1.01, 1.05))}) for row in rows]
+    assert any("weighing them gains nothing sure" in said for said in remarks(rows))
 
 
 def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():

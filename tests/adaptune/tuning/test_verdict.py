@@ -80,12 +80,14 @@ def test_the_table_says_what_each_choice_gives_and_how_to_drive_it(study, found)
     assert "*" not in table.caption.replace("`", "")
     row = found.front[0] | {"what": "any CPU time", "trial": 9, "file": "any_cost.yaml"}
     row |= {"low": 0.3, "high": 0.8, "recommended": False, "driven on": "training"}
-    own = row | {"what": "own parameters, any CPU time", "trial": 0, "low": 1.0, "high": 1.0}
+    own = row | {"what": "own parameters", "trial": 0, "low": 1.0, "high": 1.0}
+    own["in training"] = 0.67, 11.84
     bank = row | {"what": "adaptive", "trial": None, "file": "model.safetensors", "low": None}
     few = [own, row | {"odometry": "ndt"}, bank | {"recommended": True, "driven on": "test"}]
     table = front_table(study, few, "Here")
     assert table.title.startswith("Here over ")
-    assert "* Error and cost are of training." in table.caption
+    where = "of training, where own parameters have 0.67 % at 11.8 ms."
+    assert f"* Error and cost are {where}" in table.caption
     shown = ("choice", "another drive", "to drive it")
     assert [[row[key] for key in shown] for row in table.rows] == [
         ["own parameters*", "1", "change nothing"],
