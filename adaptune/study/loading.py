@@ -212,9 +212,9 @@ def read_study(
 ) -> Study[C]:
     """Read and check a study, a file or its data, with ``key.of.a.key=value`` as overrides.
 
-    The study's folder is by default the YAML's name under `runs`; that of data must be given. The
-    odometry is `needed` if it must be there to run. A ConfigurationError lists mistakes, each with
-    its line, its key and what to do.
+    The study's folder is by default the YAML's name under `runs`; that of data must be given, and
+    relative paths in these begin there. The odometry is `needed` if it must be there to run. A
+    ConfigurationError lists mistakes, each with its line, its key and what to do.
     """
     # A wrong variable is no mistake of the study.
     cache.folder()
@@ -223,7 +223,7 @@ def read_study(
         document: yaml12.Document | None = _read(given)
         here, folder = given.parent.resolve(), folder or runs / given.stem
     else:
-        document, here = None, Path.cwd()
+        document, here = None, (folder or Path()).resolve()
     data: Any = deepcopy(given) if document is None else document.data
     if folder is None:
         raise ConfigurationError("a study that is no file needs a `folder`")

@@ -51,9 +51,7 @@ def sides(
     called, now = [*map(_called, given)], time.time()
     studies = _driven(given, asked, show) if asked.recordings else _studies(called)
     _drive(studies, called, show)
-    if length is not None:
-        over = {"sub_trajectory": length}
-        studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
+    studies = studies if length is None else [_over(length, one) for one in studies]
     for name, study in zip(called, studies, strict=True):
         made = [path.stat().st_mtime for path in study.folder.glob("replays/*/*/replay.json")]
         if made and (first := min(made)) < now:
@@ -173,16 +171,21 @@ def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> "list[Offline
     for side, entry in zip(given, entries, strict=True):
         about = side if isinstance(side, str) else entry
         folders.append(FOLDER / f"{plain_name(Path(_called(side)))[:40]}_{digest(about)[:6]}")
-    first = load_study(shared | {"odometry": entries[0]}, folder=folders[0])
-    first.open()
-    refused = ensure_references(first.sequences, names, 5.0, show, required=False)
-    known = [first.sequences.open(name).reference() for name in names if name not in refused]
+    each = zip(entries, folders, strict=True)
+    both = [load_study(shared | {"odometry": of}, folder=folder) for of, folder in each]
+    both[0].open()
+    sequences = both[0].sequences
+    refused = ensure_references(sequences, names, 5.0, show, required=False)
+    known = [sequences.open(name).reference() for name in names if name not in refused]
     fastest = max((greatest_speed(one) for one in known if one is not None), default=0.0)
-    shared["sub_trajectory"] = CAR if fastest > FAST else ROBOT
     if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
         shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
-    both = zip(entries, folders, strict=True)
-    return [load_study(shared | {"odometry": of}, folder=folder) for of, folder in both]
+    return [_over(CAR if fastest > FAST else ROBOT, one) for one in both]
+
+
+def _over(length: float, study: "OfflineStudy") -> "OfflineStudy":
+    """The study with errors over another length."""
+    return replace(study, config=study.config.model_copy(update={"sub_trajectory": length}))
 
 
 def _entry(given: Any, odometry: str) -> dict[str, Any]:

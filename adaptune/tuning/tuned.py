@@ -237,7 +237,6 @@ def tune_asked(
 ) -> Tuned:
     """Do what `tune` does of what was asked."""
     from adaptune.odometry.registry import forget_user_code
-    from offline.config import load_study
     from offline.search import ELAPSED, Stopwatch
     from offline.train import odometry_rows, train
     from online.modes import BASELINE, FIXED, replay_modes, run_replays
@@ -250,9 +249,7 @@ def tune_asked(
         asked = asked._replace(portfolio=str(Path(asked.portfolio).resolve()))
     folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)
-    path, now, more = written(asked, overrides, folder, show)
-    study = load_study(path, [*overrides, *now], folder)
-    _log.info("study: %s", path)
+    study, more = written(asked, overrides, folder, show)
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
