@@ -24,7 +24,7 @@ from adaptune.commands.terminal import (
 )
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.tuning.asked import TRIALS, Asked, check_no_study
+from adaptune.tuning import TRIALS
 
 if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
@@ -58,14 +58,15 @@ def inspect(
         return
     if file.suffix in (".yaml", ".yml") and _look(file):
         return
-    check_no_study(file)
-    if study is not None and study.exists():
-        raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
+    from adaptune.tuning.asked import check_no_study
     from adaptune.tuning.studies import ROLES, begin_of_search, proposed, roles
     from adaptune.yaml12 import dump
 
+    check_no_study(file)
+    if study is not None and study.exists():
+        raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
     if _show_several(file, reading):
         return
     with progress() as show:
@@ -274,6 +275,7 @@ def tune(
     when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
+    from adaptune.tuning.asked import Asked
     from adaptune.tuning.studies import LACKING, proposed_system
     from adaptune.tuning.tuned import tune_asked
 

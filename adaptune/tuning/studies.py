@@ -11,16 +11,27 @@ from itertools import count, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from adaptune import manifest
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
+from adaptune.metrics import travelled
+from adaptune.odometry import registry
+from adaptune.odometry.portfolio import ScanKind, portfolios_of, read_portfolio
 from adaptune.progress import Progress, about
-from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded, words_of
+from adaptune.recording.config import ESTIMATED, SOURCES
+from adaptune.recording.fleet import recordings_at
+from adaptune.recording.inspect import Inspection
+from adaptune.recording.recording import open_sequence
+from adaptune.reference import check
+from adaptune.reference.carried import begin_of, without
+from adaptune.trajectory import Trajectory, read_trajectory
+from adaptune.tuning import EACH, TRIALS
+from adaptune.tuning.asked import Asked, odometries_of, recorded, words_of
 from adaptune.yaml12 import Document, YamlError, YamlPath, dump
 
 if TYPE_CHECKING:
-    from adaptune.recording.inspect import Inspection
-    from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
 
 _log = logging.getLogger(__name__)
@@ -70,12 +81,10 @@ def roles(
     Without a `test`, what follows after a `share` of the duration of a single recording is kept for
     it; of several, the last one.
     """
-    from adaptune.reference.check import TRAINING
-
     training: list[Any] = list(names)
     tested: list[Any] = list(test)
     if not test and len(names) == 1:
-        end = f"{100 * (share or TRAINING):.0f}"
+        end = f"{100 * (share or check.TRAINING):.0f}"
         training, tested = [{names[0]: f"0-{end}%"}], [{names[0]: f"{end}-100%"}]
     elif not test:
         *training, last = names
@@ -91,7 +100,7 @@ def undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) -
             recording.given["compensate"] = "constant_velocity"
 
 
-def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | None, float, str]:
+def proposed(found: Inspection, deep: bool, show: Progress) -> tuple[float | None, float, str]:
     """The split to propose, the length of sub-trajectories, and how wrong the reference is.
 
     Only what can be used to train is measured. What the scans say against it joins the findings.
@@ -100,15 +109,7 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         undo_motion([found], ["gicp"])
     if found.reference is None or len(found.reference) < 2 or found.missing.get("offline"):
         return None, USUAL_LENGTH, ""
-    from adaptune.recording.recording import open_sequence
-    from adaptune.reference import check
-    from adaptune.reference.carried import begin_of, without
-    from adaptune.reference.diagnosis import (
-        SUSPICIOUS,
-        UNEXPLAINED,
-        diagnose_reference,
-        measured_motions,
-    )
+    from adaptune.reference import diagnosis
 
     share = share_of(found.reference)
     usual = check.proposed_sub_trajectory(found.reference, training=share)
@@ -121,15 +122,20 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         measured = check.measure_reference(scans, reference, partial(show, "registering"))
         found.findings += measured.carried
         reference = without(reference, measured.carried, begin_of(scans, measured.stamps))
-        motions = measured_motions(scans, len(measured.stamps))
-        if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
+        motions = diagnosis.measured_motions(scans, len(measured.stamps))
+        if (cause := diagnosis.diagnose_reference(reference, measured.stamps, motions)) is not None:
             found.findings.append(cause.below((check.CONTRADICTS,)))
     except AdaptuneError as why:
         return share, usual, f"its error cannot be measured: {why}"
     length = check.proposed_sub_trajectory(reference, measured, share)
     accuracy, error = check.accuracy_words(measured, usual, length), measured.error(length)
-    if cause is None and not measured.doubt and error is not None and error.low > SUSPICIOUS:
-        accuracy += UNEXPLAINED
+    if (
+        cause is None
+        and not measured.doubt
+        and error is not None
+        and error.low > diagnosis.SUSPICIOUS
+    ):
+        accuracy += diagnosis.UNEXPLAINED
     words = accuracy, check.advice(measured, reference, share)
     return share, length, "; ".join(filter(None, words))
 
@@ -178,15 +184,12 @@ def _decided(
     asked: Asked, overrides: Sequence[str], folder: Path, show: Progress
 ) -> dict[str, Any]:
     """What the study of some recordings says; nothing is written but references."""
-    from adaptune.odometry.portfolio import portfolios_of
-    from adaptune.odometry.registry import declare
-    from adaptune.recording.config import ESTIMATED
     from offline.config import load_study
 
     portfolios_of((), asked.portfolio)  # a wrong one is known before all is read
     about = {name: manifest.plain(given) for name, given in asked.about.items()}
     for name in odometries_of(asked.odometry, True):
-        declare(name, about.get(name, {}).get("settings", {}), folder.resolve())
+        registry.declare(name, about.get(name, {}).get("settings", {}), folder.resolve())
     named, test = recorded(asked, show)
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
     if asked.config is not None and about:
@@ -226,16 +229,12 @@ def _decided(
 
 def begin_of_search(odometries: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The portfolios that a search begins with, as a study names them, if there are any."""
-    from adaptune.odometry.portfolio import portfolios_of
-
     found = portfolios_of(odometries)
     return {"offline": {"portfolio": found}} if found else {}
 
 
-def _tell_unlike(portfolios: Iterable[str], recordings: "Mapping[str, Inspection]") -> None:
+def _tell_unlike(portfolios: Iterable[str], recordings: Mapping[str, Inspection]) -> None:
     """Tell where a recording is unlike what portfolios know."""
-    from adaptune.odometry.portfolio import ScanKind, read_portfolio
-
     for portfolio, (name, one) in product(map(read_portfolio, portfolios), recordings.items()):
         topic = one.topics.get(one.used.get("points", ""))
         if topic is None or one.scan is None or not topic.rate:
@@ -249,9 +248,6 @@ def _tell_unlike(portfolios: Iterable[str], recordings: "Mapping[str, Inspection
 
 def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     """Add the recordings that a study does not name yet to where they belong; their names."""
-    from adaptune.recording.config import SOURCES
-    from adaptune.recording.fleet import recordings_at
-
     try:
         document = Document.of_file(path)
         data: Any = document.data
@@ -296,16 +292,12 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
 
 def _less_noisy(study: "OfflineStudy", name: str, show: Progress) -> "OfflineStudy | None":
     """The study with an estimated reference of a sequence, if its own is surely noisier."""
-    from adaptune.recording.config import ESTIMATED
-    from adaptune.recording.recording import open_sequence
-    from adaptune.reference.check import measure_reference, proposed_sub_trajectory
-
     config = study.config.sequences[name]
     scans = open_sequence(config)
     if (reference := scans.reference()) is None:
         return None
-    length = proposed_sub_trajectory(reference, training=share_of(reference))
-    measured = measure_reference(scans, reference, partial(show, "registering"))
+    length = check.proposed_sub_trajectory(reference, training=share_of(reference))
+    measured = check.measure_reference(scans, reference, partial(show, "registering"))
     if not measured.is_noisy(length) or (error := measured.error(length)) is None:
         return None
     estimated = config.model_copy(update={"reference": ESTIMATED})
@@ -337,9 +329,6 @@ def _split(
     know. A reference that is lacking is estimated: it tells how far the robot has moved. `whole`
     has the names of the recordings.
     """
-    from adaptune.reference.check import greatest_speed, path_after, proposed_sub_trajectory
-    from adaptune.trajectory import read_trajectory
-
     sequences = study.sequences
     known = {n: one for n in whole if (one := sequences.open(n).reference()) is not None}
     reference = known.get(whole[-1])
@@ -347,7 +336,7 @@ def _split(
         _estimate(study, whole[-1:], show)
         reference = read_trajectory(sequences.estimate_path(whole[-1]))
     share = share_of(reference) if len(whole) == 1 else 0.0
-    metres, _ = path_after(reference, share)
+    metres, _ = check.path_after(reference, share)
     if metres < LEAST_PATH:
         raise AdaptuneError(
             f"{whole[-1]}: moves {metres:.1f} m in the part for the test, which takes "
@@ -356,25 +345,20 @@ def _split(
         )
     others = [one for name, one in known.items() if name != whole[-1]]
     # One that fits into each of several.
-    lengths = [proposed_sub_trajectory(other, training=0.0) for other in others]
-    length = min([proposed_sub_trajectory(reference, training=share), *lengths])
-    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known.values(), reference])))
+    lengths = [check.proposed_sub_trajectory(other, training=0.0) for other in others]
+    length = min([check.proposed_sub_trajectory(reference, training=share), *lengths])
+    speed = max(LEAST_SPEED, 2.0 * max(map(check.greatest_speed, [*known.values(), reference])))
     return length, share, float(round(speed))
 
 
-def share_of(reference: "Trajectory") -> float:
+def share_of(reference: Trajectory) -> float:
     """Share of a recording's duration to train on: of its path, where it stands for long."""
-    import numpy as np
-
-    from adaptune.metrics import travelled
-    from adaptune.reference.check import TRAINING
-
     metres = travelled(reference.T_world_sensor)
     time = (reference.stamps - reference.stamps[0]) / np.ptp(reference.stamps)
-    of_path = float(np.interp(TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
-    if abs(of_path - TRAINING) <= UNEVEN:
-        return TRAINING
-    share = np.interp(TRAINING * metres[-1], metres, time)
+    of_path = float(np.interp(check.TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
+    if abs(of_path - check.TRAINING) <= UNEVEN:
+        return check.TRAINING
+    share = np.interp(check.TRAINING * metres[-1], metres, time)
     return round(float(np.clip(share, LEAST_SHARE, 1.0 - LEAST_SHARE)), 2)
 
 
@@ -440,7 +424,6 @@ def _system_of(given: str) -> dict[str, Any] | None:
 
 def is_image(given: str) -> bool:
     """Whether a name is that of an image, and of no odometry."""
-    from adaptune.odometry import registry
     from adaptune.odometry.docker.engine import EngineError, image_digest
 
     of_odometry = given in {*registry.ODOMETRIES, *registry.PROGRAMS, "all"}

@@ -15,7 +15,7 @@ from adaptune.recording.bag import BagSource
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.study import loading
-from adaptune.tuning import asked, studies, tuned
+from adaptune.tuning import EACH, TRIALS, asked, studies, tuned
 from adaptune.yaml12 import Document
 from offline.config import load_study
 from offline.front import COST
@@ -121,7 +121,7 @@ def test_what_it_decides_stands_in_a_study_file(bag, tmp_path):
     assert study.training == ["one_0-60"]
     assert study.config.test == ("one_60-100",)
     assert study.config.sub_trajectory == 2.0
-    assert study.config.offline.trials == asked.TRIALS
+    assert study.config.offline.trials == TRIALS
     assert study.config.sequences["one"].points == "/points"
     assert study.config.sequences["one"].reference == "/truth"
 
@@ -264,7 +264,7 @@ def test_several_odometries_share_a_study(bag):
     failed(bag, "--odometry", "gicp,kiss_icp")
     study = study_in("runs/one_gicp+kiss_icp/one_gicp+kiss_icp.yaml")
     assert list(study.config.odometries) == ["gicp", "kiss_icp"]
-    assert study.config.offline.trials == 2 * asked.EACH
+    assert study.config.offline.trials == 2 * EACH
     every = asked.odometries_of("all", imu=False)
     assert {"gicp", "vgicp", "ndt", "kiss_icp"} <= set(every)
     assert "evalio_kiss_icp" not in every
