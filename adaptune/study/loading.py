@@ -15,18 +15,25 @@ from adaptune.odometry.registry import (
     ABSENT,
     ODOMETRIES,
     PROGRAMS,
+    classes,
     declare,
     is_user_class,
     odometry_class,
-    where,
 )
 from adaptune.recording import cache
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, validated
-from adaptune.study.config import ROLES, OdometryConfig, OnlineConfig, StudyConfig, settle_roles
-from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
+from adaptune.study.config import (
+    ROLES,
+    OdometryConfig,
+    OnlineConfig,
+    StudyConfig,
+    settle_roles,
+    whole_definition,
+)
+from adaptune.study.study import Study
 
 _KINDS: dict[str, type[Float | Integer | Categorical]] = {
     "float": Float,
@@ -49,8 +56,8 @@ def _check_together(config: StudyConfig) -> tuple[list[Finding], ParameterSpace 
     """
     entries: dict[Key, OdometryConfig] = _entries(config.odometry)
     try:
-        described = {key: declared_odometry(one)[1] for key, one in entries.items()}
-        spaces = {key: tuned_space(one, described[key]) for key, one in entries.items()}
+        described = {key: one.declared[1] for key, one in entries.items()}
+        spaces = {key: one.space for key, one in entries.items()}
     except OdometryError:
         return [], None
     mistakes = list(_check_labels(entries))
@@ -94,7 +101,7 @@ def _check_odometry(
     ABSENT.discard(name)
     try:
         # A class of the user is imported in a process of its own.
-        where(name) if is_user_class(name) else odometry_class(name)
+        classes().where(name) if is_user_class(name) else odometry_class(name)
         at_fault = "name" if is_user_class(name) else "settings"
         declared = declare(name, settings, folder)
         mistakes += (mistake.below((*at, "settings")) for mistake in declared.mistakes)
