@@ -47,15 +47,7 @@ class Step(StrictModel):
     high: int | float | None = None
 
 
-class Settings(StrictModel):
-    """Settings of one of adaptune's own samplers."""
-
-    def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
-        """Find what does not fit the tuned parameters."""
-        raise NotImplementedError
-
-
-class AnnealingSettings(Settings):
+class AnnealingSettings(StrictModel):
     """Settings of simulated annealing, named as in RUSTLE; see ``docs/reference-study.md``."""
 
     initial_temperature: float = Field(0.1, gt=0)
@@ -72,7 +64,7 @@ class AnnealingSettings(Settings):
     steps: dict[str, Step] = Field(default_factory=dict)
 
     def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
-        """See `Settings`."""
+        """Find what does not fit the tuned parameters."""
         start = self.start or {}
         yield from _untuned("start", start, space)
         yield from _untuned("steps", self.steps, space)
@@ -95,7 +87,7 @@ class Span(StrictModel):
     count: int = Field(ge=1, le=MOST_VALUES)
 
 
-class GridSettings(Settings):
+class GridSettings(StrictModel):
     """Settings of `grid`."""
 
     # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
@@ -103,7 +95,7 @@ class GridSettings(Settings):
     grid: dict[str, Span | tuple[Value, ...]] | None = None
 
     def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
-        """See `Settings`."""
+        """Find what does not fit the tuned parameters."""
         return check_grid(self.grid or {}, space)
 
 
@@ -111,7 +103,7 @@ class RandomSettings(GridSettings):
     """Settings of `random`, which draws the points of a grid, if any, without repetition."""
 
     def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
-        """See `Settings`."""
+        """See `GridSettings`."""
         return () if self.grid is None else super().mistakes(space)
 
 
@@ -145,7 +137,7 @@ def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
             raise SamplerError(f"{name} does not take its settings: {error}") from error
 
 
-SETTINGS: dict[str, type[Settings]] = {
+SETTINGS: dict[str, type[AnnealingSettings | GridSettings]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
     "random": RandomSettings,

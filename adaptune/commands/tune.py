@@ -58,10 +58,11 @@ def inspect(
         return
     if file.suffix in (".yaml", ".yml") and _look(file):
         return
+    from adaptune.odometry.portfolio import portfolios_of
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
     from adaptune.tuning.asked import check_no_study
-    from adaptune.tuning.studies import ROLES, begin_of_search, proposed, roles
+    from adaptune.tuning.studies import ROLES, proposed, roles
     from adaptune.yaml12 import dump
 
     check_no_study(file)
@@ -81,7 +82,8 @@ def inspect(
             "serve, write `reference: estimated`"
         )
         return
-    rest = roles([found.name], length, {"name": "gicp"}, share) | begin_of_search(["gicp"])
+    rest = roles([found.name], length, {"name": "gicp"}, share)
+    rest |= {"offline": {"portfolio": portfolios_of(["gicp"])}}
     say(dump(rest, ROLES))
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "

@@ -227,12 +227,6 @@ def _decided(
     return study(length, share) | {"health": {"max_speed": speed}}
 
 
-def begin_of_search(odometries: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The portfolios that a search begins with, as a study names them, if there are any."""
-    found = portfolios_of(odometries)
-    return {"offline": {"portfolio": found}} if found else {}
-
-
 def _tell_unlike(portfolios: Iterable[str], recordings: Mapping[str, Inspection]) -> None:
     """Tell where a recording is unlike what portfolios know."""
     for portfolio, (name, one) in product(map(read_portfolio, portfolios), recordings.items()):
