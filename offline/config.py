@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from adaptune.errors import AdaptuneError, Finding, nearest
@@ -150,24 +151,20 @@ class Grid:
 
     def __init__(self, axes: Mapping[str, Sequence[Value]]):
         self.axes = dict(axes)
-        self.size = math.prod(map(len, self.axes.values()))  # number of points
+        self._shape = tuple(map(len, self.axes.values()))
+        self.size = math.prod(self._shape)  # number of points
 
     def __getitem__(self, index: int) -> ParameterSet:
-        values: ParameterSet = {}
-        for name, axis in reversed(self.axes.items()):
-            index, i = divmod(index, len(axis))
-            values[name] = axis[i]
-        return {name: values[name] for name in self.axes}
+        at = map(int, np.unravel_index(index, self._shape))
+        return {name: axis[i] for (name, axis), i in zip(self.axes.items(), at, strict=True)}
 
     def index(self, parameters: ParameterSet) -> int | None:
         """Index of a point, up to rounding; None if it is not on the grid."""
-        index = 0
-        for name, axis in self.axes.items():
-            i = next((i for i, v in enumerate(axis) if _alike(v, parameters[name])), None)
-            if i is None:
-                return None
-            index = index * len(axis) + i
-        return index
+        at = [
+            next((i for i, value in enumerate(axis) if _alike(value, parameters[name])), -1)
+            for name, axis in self.axes.items()
+        ]
+        return None if -1 in at else int(np.ravel_multi_index(at, self._shape))
 
     @classmethod
     def of(cls, space: ParameterSpace) -> "Grid | None":

@@ -259,8 +259,10 @@ def _read(path: Path) -> yaml12.Document:
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
     if document.data.keys().isdisjoint(("odometry", "sequences", "courses", "training")):
-        what = "is no study, it names no odometry and no recordings"
-        raise ConfigurationError(f"{path}: {what}; a parameter file goes with a bag, as --config")
+        raise ConfigurationError(
+            f"{path}: is no study, it names no odometry and no recordings; a parameter file goes "
+            f"with a bag, as --config, and is compared with --odometry and bags"
+        )
     return document
 
 

@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -26,7 +26,7 @@ from adaptune.space import in_words
 from adaptune.study.references import ensure_references
 from adaptune.tuning.asked import Asked, check_guarded, named_odometry, recorded, words_of
 from adaptune.tuning.studies import is_image
-from adaptune.yaml12 import Document, YamlError
+from adaptune.yaml12 import Document
 from offline.config import OfflineStudy, load_study
 from online.gate import Gate, Shared, Side, compare_sides, shared_replays
 from online.modes import BASELINE, replay_modes, sequences_without_model
@@ -138,14 +138,8 @@ def costs(shared: Shared, show: Progress) -> dict[str, Costs | str]:
 
 def _studies(given: Sequence[str]) -> list[OfflineStudy]:
     for name in given:
-        if not (path := Path(name)).exists():
+        if not Path(name).exists():
             raise AdaptuneError(f"{name}: there is no such study; or name the bags to drive, too")
-        with suppress(YamlError):
-            data = Document.of_file(path).data if path.is_file() else {"odometry": ""}
-            if not isinstance(data, dict) or "odometry" not in data:
-                raise AdaptuneError(
-                    f"{name}: is no study; of a parameter file, name the bags and --odometry, too"
-                )
     return [load_study(name, needed=Path(name).is_file()) for name in given]
 
 

@@ -129,12 +129,7 @@ def proposed(found: Inspection, deep: bool, show: Progress) -> tuple[float | Non
         return share, usual, f"its error cannot be measured: {why}"
     length = check.proposed_sub_trajectory(reference, measured, share)
     accuracy, error = check.accuracy_words(measured, usual, length), measured.error(length)
-    if (
-        cause is None
-        and not measured.doubt
-        and error is not None
-        and error.low > diagnosis.SUSPICIOUS
-    ):
+    if cause is None and not measured.doubt and error and error.low > diagnosis.SUSPICIOUS:
         accuracy += diagnosis.UNEXPLAINED
     words = accuracy, check.advice(measured, reference, share)
     return share, length, "; ".join(filter(None, words))
