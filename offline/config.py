@@ -485,7 +485,6 @@ def load_study(
     study: Path | str | Mapping[str, Any],
     overrides: Sequence[str] = (),
     folder: Path | None = None,
-    runs: Path = Path("runs"),
     needed: bool = True,
 ) -> OfflineStudy:
     """Read and check a whole study, see `adaptune.study.loading.read_study`.
@@ -503,4 +502,4 @@ def load_study(
         if not (given / CONFIGURATION).exists():
             raise ConfigurationError(f"{given}: is no study's folder: there is no study.yaml in it")
         given, folder = given / CONFIGURATION, folder or given
-    return read_study(given, OfflineStudyConfig, overrides, folder, runs, needed)
+    return read_study(given, OfflineStudyConfig, overrides, folder, needed)

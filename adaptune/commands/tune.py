@@ -77,10 +77,8 @@ def inspect(
     if not found.name:
         return
     if found.missing.get("offline"):
-        say(
-            "Next: mend what is lacking, see docs/your-bag.md; where only the reference does not "
-            "serve, write `reference: estimated`"
-        )
+        help_ = "where only the reference does not serve, write `reference: estimated`"
+        say(f"Next: mend what is lacking, see docs/your-bag.md; {help_}")
         return
     rest = roles([found.name], length, {"name": "gicp"}, share)
     rest |= {"offline": {"portfolio": portfolios_of(["gicp"])}}

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from copy import deepcopy
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
@@ -214,12 +213,11 @@ def read_study(
     config_type: type[C],
     overrides: Sequence[str] = (),
     folder: Path | None = None,
-    runs: Path = Path("runs"),
     needed: bool = True,
 ) -> Study[C]:
     """Read and check a study, a file or its data, with ``key.of.a.key=value`` as overrides.
 
-    The study's folder is by default the YAML's name under `runs`; that of data must be given, and
+    The study's folder is by default the YAML's name under ``runs``; that of data must be given, and
     relative paths in these begin there. The odometry is `needed` if it must be there to run. A
     ConfigurationError lists mistakes, each with its line, its key and what to do.
     """
@@ -227,22 +225,22 @@ def read_study(
     cache.folder()
     cache.cap()
     if isinstance(given, Path):
-        document: yaml12.Document | None = _read(given)
-        here, folder = given.parent.resolve(), folder or runs / given.stem
+        document, here = _read(given), given.parent.resolve()
+        folder = folder or Path("runs") / given.stem
+    elif folder is not None:
+        document, here = yaml12.Document(yaml12.dump(given)), folder.resolve()
     else:
-        document, here = None, (folder or Path()).resolve()
-    data: Any = deepcopy(given) if document is None else document.data
-    if folder is None:
         raise ConfigurationError("a study that is no file needs a `folder`")
+    data: Any = document.data
     for role in ROLES:  # 00 is a name there
         named = data.get(role) if isinstance(data.get(role), list) else []
         for i, name in enumerate(named):
             if not isinstance(name, str | list | dict):
-                named[i] = str(name) if document is None else document.name((role, i))
+                named[i] = document.name((role, i))
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, here, needed)
     if mistakes or config is None:
-        mistakes.sort(key=lambda mistake: (document and document.line(mistake.where)) or 0)
+        mistakes.sort(key=lambda mistake: document.line(mistake.where) or 0)
         said = dict.fromkeys(_say(m, given, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
     return Study(config, folder)
@@ -291,14 +289,12 @@ def _override(data: dict[str, Any], text: str) -> Key:
     return path
 
 
-def _say(
-    mistake: Finding, file: Any, document: yaml12.Document | None, overridden: Sequence[Key]
-) -> str:
+def _say(mistake: Finding, given: Any, document: yaml12.Document, overridden: Sequence[Key]) -> str:
     key = mistake.where
     # The mistake of a whole section may be the mistake of a value in it.
     if any(key[: len(o)] == o[: len(key)] for o in overridden):
         return f"-o: {mistake}"
-    return str(mistake) if document is None else f"{document.where(file, key)}: {mistake}"
+    return f"{document.where(given, key)}: {mistake}" if isinstance(given, Path) else str(mistake)
 
 
 def _check(
