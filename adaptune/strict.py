@@ -5,6 +5,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -13,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
-from adaptune.errors import AdaptuneError, Finding, Key, nearest
+from adaptune.errors import AdaptuneError, Finding, Key, in_a_line, nearest
 
 _LARGEST = 10**100
 """No number is as large; the square of one is still a number."""
@@ -237,47 +238,59 @@ def _keys(annotation: Any, path: Sequence[str | int]) -> list[str]:
     return keys
 
 
-# Import an object by its name: a built-in one, one of another package, or ``module:attribute``.
+@dataclass(frozen=True)
+class Plugins:
+    """Objects of one kind by name: built-in ones, other packages', and ``module:attribute``."""
 
+    kind: str  # in messages, as "odometry"
+    ours: Mapping[str, str]  # where the built-in ones are
+    error: type[AdaptuneError]  # says that there is none of a name
+    group: str = ""  # of entry points, in which installed packages announce theirs
+    sort: str = "Class"  # or "function"
 
-class PluginError(AdaptuneError):
-    """A name for which there is no object."""
+    def where(self, name: str) -> str:
+        """Where an object is, as ``module:attribute``, without importing it."""
+        path = self.ours.get(name) or (name if ":" in name else None)
+        if path is None:
+            announced = {point.name: point.value for point in entry_points(group=self.group)}
+            if name not in announced:
+                help_ = f"{nearest(name, [*self.ours, *announced])} (a {self.sort.lower()} of your "
+                what = f"there is no {self.kind} {name!r}: {help_}own is module:{self.sort})"
+                raise self.error(what)
+            path = announced[name]
+        module, _, own = path.partition(":")
+        if module == "__main__":  # of a notebook; trials run in other processes
+            help_ = f"put it into a file, mine.py, and name mine:{own}"
+            raise self.error(f"{name}: {own} lives in this session only; {help_}")
+        if not all(map(str.isidentifier, module.split("."))):
+            help_ = f"write it as Python imports it, as in my_package.my_module:{self.sort}"
+            if self.kind == "odometry":
+                help_ += "; of images, `docker images` has none of this name"
+            raise self.error(f"{name}: {module!r} is not the name of a module; {help_}")
+        return path
 
+    def load(self, name: str) -> Any:
+        """Import an object."""
+        module, _, attribute = self.where(name).partition(":")
+        try:
+            return getattr(import_module(module), attribute)
+        except ImportError as error:
+            help_ = "install it, or name its folder in PYTHONPATH"
+            raise self.error(f"{name}: cannot import {module} ({error}); {help_}") from error
+        except (ConfigurationError, ValidationError) as error:
+            raise self.error(f"{name}: cannot import {module} ({in_one_line(error)})") from error
+        except AttributeError as error:
+            what = f"{module} has no {attribute or self.sort.lower()}"
+            raise self.error(f"{name}: {what}") from error
 
-def path_of(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> str:
-    """Where an object is, as ``module:attribute``, without importing it.
-
-    It is named as one of `ours`, the built-in ones, by what an installed package announces in the
-    entry-point group, or as ``module:attribute``. Messages call it a `kind`, as "odometry", and a
-    ``Class`` or a ``function``, which is its sort.
-    """
-    path = ours.get(name) or (name if ":" in name else None)
-    if path is None:
-        announced = {point.name: point.value for point in entry_points(group=group)}
-        if name not in announced:
-            help_ = f"{nearest(name, [*ours, *announced])} (a {sort.lower()} of your own is"
-            raise PluginError(f"there is no {kind} {name!r}: {help_} module:{sort})")
-        path = announced[name]
-    module, _, own = path.partition(":")
-    if module == "__main__":  # of a notebook; trials run in other processes
-        help_ = f"put it into a file, mine.py, and name mine:{own}"
-        raise PluginError(f"{name}: {own} lives in this session only; {help_}")
-    if not all(map(str.isidentifier, module.split("."))):
-        help_ = f"write it as Python imports it, as in my_package.my_module:{sort}"
-        help_ += "; of images, `docker images` has none of this name" * (kind == "odometry")
-        raise PluginError(f"{name}: {module!r} is not the name of a module; {help_}")
-    return path
-
-
-def load(name: str, path: str, sort: str) -> Any:
-    """Import an object by its name from where it is, ``module:attribute``."""
-    module, _, attribute = path.partition(":")
-    try:
-        return getattr(import_module(module), attribute)
-    except ImportError as error:
-        help_ = "install it, or name its folder in PYTHONPATH"
-        raise PluginError(f"{name}: cannot import {module} ({error}); {help_}") from error
-    except (ConfigurationError, ValidationError) as error:
-        raise PluginError(f"{name}: cannot import {module} ({in_one_line(error)})") from error
-    except AttributeError as error:
-        raise PluginError(f"{name}: {module} has no {attribute or sort}") from error
+    def derived(self, name: str, base: type, base_name: str) -> type[Any]:
+        """Import a class, which may be the user's, that is derived from another one."""
+        try:
+            found = self.load(name)
+        except self.error:
+            raise
+        except Exception as error:
+            raise self.error(f"{name}: cannot be imported: {in_a_line(error)}") from error
+        if not (isinstance(found, type) and issubclass(found, base)):
+            raise self.error(f"{name}: is not a class derived from {base_name}")
+        return found

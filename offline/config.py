@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field
+import numpy as np
+from pydantic import BeforeValidator, Field
 
-from adaptune import strict
-from adaptune.errors import AdaptuneError, Finding, in_a_line, nearest
+from adaptune.errors import AdaptuneError, Finding, nearest
 from adaptune.odometry.registry import PROGRAMS
 from adaptune.space import (
     Categorical,
@@ -22,7 +22,7 @@ from adaptune.space import (
     Value,
     describe,
 )
-from adaptune.strict import ConfigurationError, StrictModel, validated
+from adaptune.strict import ConfigurationError, Plugins, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.portfolios import portfolio_sets
 from adaptune.study.study import CONFIGURATION, Study
@@ -64,6 +64,17 @@ class AnnealingSettings(StrictModel):
     start: dict[str, int | float] | None = None
     steps: dict[str, Step] = Field(default_factory=dict)
 
+    def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
+        """Find what does not fit the tuned parameters."""
+        start = self.start or {}
+        yield from _untuned("start", start, space)
+        yield from _untuned("steps", self.steps, space)
+        for key, parameter in space.parameters.items():
+            if key in start:
+                yield from _check_start(key, parameter, start[key], self.steps.get(key))
+            if key in self.steps:
+                yield from _check_step(key, parameter, self.steps[key])
+
 
 MOST_VALUES = 100_000
 """Of one parameter in a grid."""
@@ -78,11 +89,23 @@ class Span(StrictModel):
 
 
 class GridSettings(StrictModel):
-    """Settings of `grid`, and of `random`, which draws the grid's points without repetition."""
+    """Settings of `grid`."""
 
     # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
     # default all.
     grid: dict[str, Span | tuple[Value, ...]] | None = None
+
+    def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
+        """Find what does not fit the tuned parameters."""
+        return check_grid(self.grid or {}, space)
+
+
+class RandomSettings(GridSettings):
+    """Settings of `random`, which draws the points of a grid, if any, without repetition."""
+
+    def mistakes(self, space: ParameterSpace) -> Iterable[Finding]:
+        """See `GridSettings`."""
+        return () if self.grid is None else super().mistakes(space)
 
 
 def optuna_class(name: str) -> type[Any]:
@@ -94,16 +117,8 @@ def optuna_class(name: str) -> type[Any]:
         )
     from optuna.samplers import BaseSampler
 
-    try:
-        path = strict.path_of(name, "sampler", OPTUNA, "", "Class")
-        found = strict.load(name, path, "class")
-    except strict.PluginError as error:
-        raise SamplerError(str(error)) from error
-    except Exception as error:  # of a module of the user
-        raise SamplerError(f"{name}: cannot be imported: {in_a_line(error)}") from error
-    if not (isinstance(found, type) and issubclass(found, BaseSampler)):
-        raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
-    return found
+    classes = Plugins("sampler", OPTUNA, SamplerError)
+    return classes.derived(name, BaseSampler, "optuna.samplers.BaseSampler")
 
 
 def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
@@ -123,10 +138,10 @@ def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
             raise SamplerError(f"{name} does not take its settings: {error}") from error
 
 
-SETTINGS: dict[str, type[BaseModel]] = {
+SETTINGS: dict[str, type[AnnealingSettings | GridSettings]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
-    "random": GridSettings,
+    "random": RandomSettings,
 }
 """Settings of adaptune's own samplers."""
 
@@ -136,24 +151,20 @@ class Grid:
 
     def __init__(self, axes: Mapping[str, Sequence[Value]]):
         self.axes = dict(axes)
-        self.size = math.prod(map(len, self.axes.values()))  # number of points
+        self._shape = tuple(map(len, self.axes.values()))
+        self.size = math.prod(self._shape)  # number of points
 
     def __getitem__(self, index: int) -> ParameterSet:
-        values: ParameterSet = {}
-        for name, axis in reversed(self.axes.items()):
-            index, i = divmod(index, len(axis))
-            values[name] = axis[i]
-        return {name: values[name] for name in self.axes}
+        at = map(int, np.unravel_index(index, self._shape))
+        return {name: axis[i] for (name, axis), i in zip(self.axes.items(), at, strict=True)}
 
     def index(self, parameters: ParameterSet) -> int | None:
         """Index of a point, up to rounding; None if it is not on the grid."""
-        index = 0
-        for name, axis in self.axes.items():
-            i = next((i for i, v in enumerate(axis) if _alike(v, parameters[name])), None)
-            if i is None:
-                return None
-            index = index * len(axis) + i
-        return index
+        at = [
+            next((i for i, value in enumerate(axis) if _alike(value, parameters[name])), -1)
+            for name, axis in self.axes.items()
+        ]
+        return None if -1 in at else int(np.ravel_multi_index(at, self._shape))
 
     @classmethod
     def of(cls, space: ParameterSpace) -> "Grid | None":
@@ -283,44 +294,22 @@ _NOT_SET = {
 """Settings of Optuna's samplers that a study does not have, and why."""
 
 
-def check_sampler(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
-) -> Iterable[Finding]:
-    """Find mistakes in a sampler's settings; their keys begin below the settings.
-
-    Without a `space`, those that only the parameters show are not found.
-    """
-    if name == "tpe" and not settings:
-        return  # a look at Optuna would take long
-    if name not in SETTINGS:
-        yield from _check_optuna(name, settings)
-    elif space is None:
+def _check_optuna(name: str, given: Mapping[str, Any]) -> Iterable[Finding]:
+    """Find mistakes in the name of an Optuna sampler, and in its settings."""
+    key = "sampler_settings"
+    try:
+        optuna_class(name)
+    except SamplerError as error:
+        yield Finding(("sampler",), str(error))
         return
-    elif name == "annealing":
-        given = AnnealingSettings.model_validate(settings)
-        steps, start = given.steps, given.start or {}
-        yield from _untuned("start", start, space)
-        yield from _untuned("steps", steps, space)
-        for key, parameter in space.parameters.items():
-            if key in start:
-                yield from _check_start(key, parameter, start[key], steps.get(key))
-            if key in steps:
-                yield from _check_step(key, parameter, steps[key])
-    elif name in ("grid", "random"):
-        axes = GridSettings.model_validate(settings).grid
-        if axes is not None or name == "grid":
-            yield from check_grid(axes or {}, space)
-
-
-def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Finding]:
-    if taken := next((key for key in _NOT_SET if key in settings), None):
-        yield Finding((taken,), _NOT_SET[taken])
+    if taken := next((setting for setting in _NOT_SET if setting in given), None):
+        yield Finding((key, taken), _NOT_SET[taken])
         return
     try:
-        optuna_sampler(name, settings, 0)
+        optuna_sampler(name, given, 0)
     except SamplerError as error:
-        key, _, rest = str(error).partition(": ")
-        yield Finding((key,), rest) if key in settings else Finding((), str(error))
+        setting, _, rest = str(error).partition(": ")
+        yield Finding((key, setting), rest) if setting in given else Finding((key,), str(error))
 
 
 def _check_step(name: str, parameter: Parameter, step: Step) -> Iterable[Finding]:
@@ -416,7 +405,7 @@ class OfflineConfig(StrictModel):
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Finding]:
         """Find mistakes in the sampler and its settings."""
-        key, n = ("sampler_settings",), 1 if space is None else len(space.baselines)
+        n = 1 if space is None else len(space.baselines)
         if n > 1 and (self.sampler not in ("tpe", "random") or "grid" in self.sampler_settings):
             message = "with several odometries, choose tpe or random, without a grid"
             yield Finding(("sampler",), message)
@@ -425,18 +414,12 @@ class OfflineConfig(StrictModel):
             yield Finding(("trials",), message)
         if self.sampler in SETTINGS:
             found: list[Finding] = []
-            validated(SETTINGS[self.sampler], self.sampler_settings, key, found)
-            if found:
-                yield from found
-                return
-        elif self.sampler != "tpe":  # which is always there, and need not be imported
-            try:
-                optuna_class(self.sampler)
-            except SamplerError as error:
-                yield Finding(("sampler",), str(error))
-                return
-        below = check_sampler(self.sampler, self.sampler_settings, space)
-        yield from (mistake.below(key) for mistake in below)
+            own = validated(SETTINGS[self.sampler], self.sampler_settings, (), found)
+            if own is not None and space is not None:
+                found += own.mistakes(space)
+            yield from (mistake.below(("sampler_settings",)) for mistake in found)
+        elif self.sampler != "tpe" or self.sampler_settings:  # to import Optuna takes long
+            yield from _check_optuna(self.sampler, self.sampler_settings)
 
 
 _SEARCH = (
@@ -502,7 +485,6 @@ def load_study(
     study: Path | str | Mapping[str, Any],
     overrides: Sequence[str] = (),
     folder: Path | None = None,
-    runs: Path = Path("runs"),
     needed: bool = True,
 ) -> OfflineStudy:
     """Read and check a whole study, see `adaptune.study.loading.read_study`.
@@ -520,4 +502,4 @@ def load_study(
         if not (given / CONFIGURATION).exists():
             raise ConfigurationError(f"{given}: is no study's folder: there is no study.yaml in it")
         given, folder = given / CONFIGURATION, folder or given
-    return read_study(given, OfflineStudyConfig, overrides, folder, runs, needed)
+    return read_study(given, OfflineStudyConfig, overrides, folder, needed)

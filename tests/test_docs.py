@@ -358,7 +358,7 @@ def test_the_example_of_a_program_follows_a_drive(study_file, tmp_path, monkeypa
     )
     (tmp_path / "kiss_icp.yaml").write_text(template)
     (tmp_path / "study.yaml").write_text(drives.study_with(example, study_file.parent))
-    setup = setup_of(load_study(tmp_path / "study.yaml", runs=tmp_path / "runs"))
+    setup = setup_of(load_study(tmp_path / "study.yaml", folder=tmp_path / "runs/study"))
     (trial,) = trials_of(setup, [{"mapping.voxel_size": 0.5}])
     assert not trial.faults
     assert np.nanmean(trial.errors) < 5.0

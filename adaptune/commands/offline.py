@@ -25,7 +25,6 @@ from adaptune.commands.terminal import (
 )
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
-from adaptune.tuning.asked import check_no_study
 
 if TYPE_CHECKING:
     from adaptune.reference.stored import StoredEstimate
@@ -232,6 +231,7 @@ def reference(
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import estimate, stored
     from adaptune.reference.check import proposed_sub_trajectory
+    from adaptune.tuning.asked import check_no_study
 
     check_no_study(recording)
     config = estimate.recording_config(inspect(recording), points)

@@ -24,7 +24,7 @@ from adaptune.commands.terminal import (
 )
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.tuning.asked import TRIALS, Asked, check_no_study
+from adaptune.tuning import TRIALS
 
 if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
@@ -58,14 +58,16 @@ def inspect(
         return
     if file.suffix in (".yaml", ".yml") and _look(file):
         return
+    from adaptune.odometry.portfolio import portfolios_of
+    from adaptune.recording.inspect import inspect as inspect_file
+    from adaptune.recording.rendering import render_inspection
+    from adaptune.tuning.asked import check_no_study
+    from adaptune.tuning.studies import ROLES, proposed, roles
+    from adaptune.yaml12 import dump
+
     check_no_study(file)
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
-    from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.recording.rendering import render_inspection
-    from adaptune.tuning.studies import ROLES, begin_of_search, proposed, roles
-    from adaptune.yaml12 import dump
-
     if _show_several(file, reading):
         return
     with progress() as show:
@@ -75,12 +77,11 @@ def inspect(
     if not found.name:
         return
     if found.missing.get("offline"):
-        say(
-            "Next: mend what is lacking, see docs/your-bag.md; where only the reference does not "
-            "serve, write `reference: estimated`"
-        )
+        help_ = "where only the reference does not serve, write `reference: estimated`"
+        say(f"Next: mend what is lacking, see docs/your-bag.md; {help_}")
         return
-    rest = roles([found.name], length, {"name": "gicp"}, share) | begin_of_search(["gicp"])
+    rest = roles([found.name], length, {"name": "gicp"}, share)
+    rest |= {"offline": {"portfolio": portfolios_of(["gicp"])}}
     say(dump(rest, ROLES))
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "
@@ -274,6 +275,7 @@ def tune(
     when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
+    from adaptune.tuning.asked import Asked
     from adaptune.tuning.studies import LACKING, proposed_system
     from adaptune.tuning.tuned import tune_asked
 

@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import processes, strict
+from adaptune import processes
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.odometry import wire
 from adaptune.odometry.content import python_content
 from adaptune.recording.scan import Scan
+from adaptune.strict import Plugins
 
 MOTION = "motion"
 """Name of the descriptor that is filled in from poses."""
@@ -78,24 +79,12 @@ _SECONDS = 60.0
 """A descriptor of the user may take so long for a scan."""
 
 
-def where(name: str) -> str:
-    """Where the function of a descriptor is, as ``module:function``, without importing it.
-
-    `name` is one of `DESCRIPTORS`, one that an installed package announces in the entry-point group
-    ``adaptune.descriptors``, or ``module:function``; else there is a DescriptorError.
-    """
-    try:
-        return strict.path_of(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
-    except strict.PluginError as error:
-        raise DescriptorError(str(error)) from error
+FUNCTIONS = Plugins("descriptor", DESCRIPTORS, DescriptorError, ENTRY_POINTS, "function")
 
 
 def descriptor(name: str) -> Descriptor:
-    """Function of a descriptor, see `where`; a DescriptorError if there is none."""
-    try:
-        found = strict.load(name, where(name), "function")
-    except strict.PluginError as error:
-        raise DescriptorError(str(error)) from error
+    """Function of a descriptor; a DescriptorError if there is none."""
+    found = FUNCTIONS.load(name)
     if not callable(found):
         raise DescriptorError(f"{name}: is not a function from a scan to an array")
     describe: Descriptor = found
@@ -104,7 +93,7 @@ def descriptor(name: str) -> Descriptor:
 
 def check_descriptor(name: str) -> None:
     """Refuse a name that leads to no descriptor; the user's are imported elsewhere."""
-    path = where(name)
+    path = FUNCTIONS.where(name)
     if name not in DESCRIPTORS:
         try:
             processes.server(_SERVICE, path)
@@ -135,7 +124,9 @@ def answers(name: str) -> processes.Answer:
 def _hosted(name: str) -> Descriptor:
     """Function of a descriptor of the user that runs in a process of its own."""
     bounds = processes.Bounds(_SECONDS, late=f"a scan took longer than {_SECONDS:g} s")
-    process = processes.Conversation(processes.Forked(_SERVICE, where(name), "answers", bounds))
+    process = processes.Conversation(
+        processes.Forked(_SERVICE, FUNCTIONS.where(name), "answers", bounds)
+    )
 
     def describe(scan: Scan) -> NDArray[np.float32]:
         try:

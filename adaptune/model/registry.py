@@ -4,10 +4,10 @@ from collections.abc import Callable, Collection
 from textwrap import shorten
 from typing import Any
 
-from adaptune import strict
 from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.model.rules import NOTHING, Live, Rule
 from adaptune.space import ParameterSets, Selection
+from adaptune.strict import Plugins
 
 RULES = {
     "adaptive": "adaptune.model.weights:BankRule",
@@ -29,17 +29,8 @@ def rule_class(name: str, also: Collection[str] = ()) -> type[Rule]:
 
     A `RuleError` says why there is none, and names `also` modes that are no rules.
     """
-    try:
-        ours = RULES | dict.fromkeys(also, "")
-        path = strict.path_of(name, "mode", ours, ENTRY_POINTS, "Class")
-        found = strict.load(name, path, "class")
-    except strict.PluginError as error:
-        raise RuleError(str(error)) from error
-    except Exception as error:  # of a module of the user
-        raise RuleError(f"{name}: cannot be imported: {strict.in_one_line(error)}") from error
-    if not (isinstance(found, type) and issubclass(found, Rule)):
-        raise RuleError(f"{name}: is not a class derived from adaptune.model.Rule")
-    return found
+    classes = Plugins("mode", RULES | dict.fromkeys(also, ""), RuleError, ENTRY_POINTS)
+    return classes.derived(name, Rule, "adaptune.model.Rule")
 
 
 def asked(method: Callable[..., Any], *given: Any) -> Any:

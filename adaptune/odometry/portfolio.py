@@ -1,6 +1,7 @@
 """A portfolio: a few parameter sets of an odometry, of which one does well in nearly each place."""
 
 from collections.abc import Collection, Iterable
+from functools import cache
 from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
@@ -9,6 +10,7 @@ from pydantic import Field
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError, Finding, nearest
+from adaptune.recording.cache import status_key
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Value
 from adaptune.strict import StrictModel, validated
@@ -116,7 +118,13 @@ def path_of(name: str) -> Path:
 
 def read_portfolio(name: str) -> Portfolio:
     """Read a portfolio; an AdaptuneError names the file, the line and the key of each mistake."""
-    document, mistakes = Document.of_file(path := path_of(name)), list[Finding]()
+    path = path_of(name)
+    return _read(path, status_key(path) if path.is_file() else "")
+
+
+@cache
+def _read(path: Path, status: str) -> Portfolio:  # noqa: ARG001 - it tells other content
+    document, mistakes = Document.of_file(path), list[Finding]()
     if (found := validated(Portfolio, document.data, (), mistakes)) is None:
         said = (f"{document.where(path, one.where)}: {one}" for one in mistakes)
         raise PortfolioError("\n".join(said))

@@ -11,14 +11,14 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, RootModel
 
-from adaptune import processes, strict
+from adaptune import processes
 from adaptune.errors import Finding, NotInstalledError, OdometryError, hidden
 from adaptune.odometry import wire
 from adaptune.odometry.base import Description, Odometry, ToolSettings
 from adaptune.odometry.remote import SERVICE
 from adaptune.odometry.template import Template
 from adaptune.space import ParameterSet, ParameterSpace
-from adaptune.strict import validated
+from adaptune.strict import Plugins, validated
 
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
@@ -66,24 +66,21 @@ def is_user_class(name: str) -> bool:
     return name not in ODOMETRIES and name not in PROGRAMS
 
 
-def where(name: str) -> str:
-    """Where the class of an odometry is, as ``module:Class``; an error names the nearest one."""
-    try:
-        return strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
-    except strict.PluginError as error:
-        raise OdometryError(str(error)) from error
+def classes() -> Plugins:
+    """The classes of odometries."""
+    return Plugins("odometry", ODOMETRIES | PROGRAMS, OdometryError, ENTRY_POINTS)
 
 
 def odometry_class(name: str) -> type[Any]:
     """Class of an odometry, by its name as in a study; an `OdometryError` if there is none."""
     try:
-        cls = strict.load(name, where(name), "class")
-    except strict.PluginError as error:
+        cls = classes().load(name)
+    except OdometryError as error:
         if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
             what = f"{name} cannot be imported ({error.__cause__})"
             help_ = hidden(error.__cause__) or f"run `pip install {PACKAGES.get(name, name)}`"
             raise NotInstalledError(f"{what}; {help_}") from error
-        raise OdometryError(str(error)) from error
+        raise
     if name in PROGRAMS:
         return cls  # type: ignore[no-any-return]
     if not (isinstance(cls, type) and issubclass(cls, Odometry)):

@@ -133,6 +133,8 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
+_shown: dict[tuple[object, ...], Mapping[str, Any]] = {}
+"""What opening bags has shown in this process, by their files."""
 _poses: dict[tuple[object, ...], Trajectory] = {}
 _MOST_POSES = 32
 """Those that were read last, by files and topic, and how many of them are kept."""
@@ -145,8 +147,8 @@ class BagSource:
     no usable message on it. It names the bags and the message, or the topics that there are.
 
     `paths` are as `bag_paths` gives them. The topic of the point clouds may be left out where there
-    is only one, and their frame where the topic has only one. Given the result of `about`, the bags
-    are not opened now.
+    is only one, and their frame where the topic has only one. Given the result of `about`, or where
+    the same bags were opened before, they are not opened now.
     """
 
     pose_files: Sequence[Path] = ()
@@ -161,6 +163,8 @@ class BagSource:
         within: tuple[float, float] = (0.0, math.inf),
     ):
         self.paths, self.timing, self.frame = tuple(paths), timing, frame
+        key = (*map(status_key, self.files), points, within)
+        about = _shown.get(key) if about is None else about
         given = UNOPENED if about is None else about
         self.topics: dict[str, str] = dict(given["topics"])
         self.points: str = given["points"]
@@ -182,6 +186,7 @@ class BagSource:
             begins = {topic: self._begin(reader, topic) for topic in known}
             self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
             self.look_at_clock(reader, within)
+        _shown[key] = self.about()
 
     def about(self) -> dict[str, Any]:
         """Everything that opening the bags has shown, as plain data."""

@@ -4,12 +4,13 @@ import logging
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from adaptune.errors import Finding, nearest
+from adaptune.odometry.base import Description
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.remote import Limits
 from adaptune.recording.config import Fractions, SequenceConfig, Transform, part_name, read_part
@@ -50,6 +51,31 @@ class OdometryConfig(StrictModel):
     @classmethod
     def _name_alone(cls, data: Any) -> Any:
         return {"name": data} if isinstance(data, str) else data
+
+    @cached_property
+    def declared(self) -> tuple[Any, Description]:
+        """The checked settings, and the odometry's description with them; else an OdometryError."""
+        from adaptune.odometry.registry import declare
+
+        return declare(self.name, self.settings).sound(self.name)
+
+    @cached_property
+    def space(self) -> ParameterSpace:
+        """The parameters that are tuned: those that are named here, by default all."""
+        own = self.declared[1].space
+        if self.parameters is None:
+            return own or ParameterSpace({})
+        each = self.parameters.items()
+        return ParameterSpace.load({name: whole_definition(own, name, d) for name, d in each})
+
+
+def whole_definition(
+    space: ParameterSpace | None, name: str, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Definition of a parameter: the study's values, and the odometry's own for the rest."""
+    own = {} if space is None else space.parameters[name].model_dump()
+    other = given.get("type", own.get("type")) != own.get("type")
+    return dict(given) if other else own | dict(given)
 
 
 def _known_descriptor(name: str) -> str:

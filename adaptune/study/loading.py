@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from copy import deepcopy
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,18 +14,25 @@ from adaptune.odometry.registry import (
     ABSENT,
     ODOMETRIES,
     PROGRAMS,
+    classes,
     declare,
     is_user_class,
     odometry_class,
-    where,
 )
 from adaptune.recording import cache
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, validated
-from adaptune.study.config import ROLES, OdometryConfig, OnlineConfig, StudyConfig, settle_roles
-from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
+from adaptune.study.config import (
+    ROLES,
+    OdometryConfig,
+    OnlineConfig,
+    StudyConfig,
+    settle_roles,
+    whole_definition,
+)
+from adaptune.study.study import Study
 
 _KINDS: dict[str, type[Float | Integer | Categorical]] = {
     "float": Float,
@@ -49,8 +55,8 @@ def _check_together(config: StudyConfig) -> tuple[list[Finding], ParameterSpace 
     """
     entries: dict[Key, OdometryConfig] = _entries(config.odometry)
     try:
-        described = {key: declared_odometry(one)[1] for key, one in entries.items()}
-        spaces = {key: tuned_space(one, described[key]) for key, one in entries.items()}
+        described = {key: one.declared[1] for key, one in entries.items()}
+        spaces = {key: one.space for key, one in entries.items()}
     except OdometryError:
         return [], None
     mistakes = list(_check_labels(entries))
@@ -94,7 +100,7 @@ def _check_odometry(
     ABSENT.discard(name)
     try:
         # A class of the user is imported in a process of its own.
-        where(name) if is_user_class(name) else odometry_class(name)
+        classes().where(name) if is_user_class(name) else odometry_class(name)
         at_fault = "name" if is_user_class(name) else "settings"
         declared = declare(name, settings, folder)
         mistakes += (mistake.below((*at, "settings")) for mistake in declared.mistakes)
@@ -207,35 +213,34 @@ def read_study(
     config_type: type[C],
     overrides: Sequence[str] = (),
     folder: Path | None = None,
-    runs: Path = Path("runs"),
     needed: bool = True,
 ) -> Study[C]:
     """Read and check a study, a file or its data, with ``key.of.a.key=value`` as overrides.
 
-    The study's folder is by default the YAML's name under `runs`; that of data must be given. The
-    odometry is `needed` if it must be there to run. A ConfigurationError lists mistakes, each with
-    its line, its key and what to do.
+    The study's folder is by default the YAML's name under ``runs``; that of data must be given, and
+    relative paths in these begin there. The odometry is `needed` if it must be there to run. A
+    ConfigurationError lists mistakes, each with its line, its key and what to do.
     """
     # A wrong variable is no mistake of the study.
     cache.folder()
     cache.cap()
     if isinstance(given, Path):
-        document: yaml12.Document | None = _read(given)
-        here, folder = given.parent.resolve(), folder or runs / given.stem
+        document, here = _read(given), given.parent.resolve()
+        folder = folder or Path("runs") / given.stem
+    elif folder is not None:
+        document, here = yaml12.Document(yaml12.dump(given)), folder.resolve()
     else:
-        document, here = None, Path.cwd()
-    data: Any = deepcopy(given) if document is None else document.data
-    if folder is None:
         raise ConfigurationError("a study that is no file needs a `folder`")
+    data: Any = document.data
     for role in ROLES:  # 00 is a name there
         named = data.get(role) if isinstance(data.get(role), list) else []
         for i, name in enumerate(named):
             if not isinstance(name, str | list | dict):
-                named[i] = str(name) if document is None else document.name((role, i))
+                named[i] = document.name((role, i))
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, here, needed)
     if mistakes or config is None:
-        mistakes.sort(key=lambda mistake: (document and document.line(mistake.where)) or 0)
+        mistakes.sort(key=lambda mistake: document.line(mistake.where) or 0)
         said = dict.fromkeys(_say(m, given, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
     return Study(config, folder)
@@ -252,8 +257,10 @@ def _read(path: Path) -> yaml12.Document:
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
     if document.data.keys().isdisjoint(("odometry", "sequences", "courses", "training")):
-        what = "is no study, it names no odometry and no recordings"
-        raise ConfigurationError(f"{path}: {what}; a parameter file goes with a bag, as --config")
+        raise ConfigurationError(
+            f"{path}: is no study, it names no odometry and no recordings; a parameter file goes "
+            f"with a bag, as --config, and is compared with --odometry and bags"
+        )
     return document
 
 
@@ -282,14 +289,12 @@ def _override(data: dict[str, Any], text: str) -> Key:
     return path
 
 
-def _say(
-    mistake: Finding, file: Any, document: yaml12.Document | None, overridden: Sequence[Key]
-) -> str:
+def _say(mistake: Finding, given: Any, document: yaml12.Document, overridden: Sequence[Key]) -> str:
     key = mistake.where
     # The mistake of a whole section may be the mistake of a value in it.
     if any(key[: len(o)] == o[: len(key)] for o in overridden):
         return f"-o: {mistake}"
-    return str(mistake) if document is None else f"{document.where(file, key)}: {mistake}"
+    return f"{document.where(given, key)}: {mistake}" if isinstance(given, Path) else str(mistake)
 
 
 def _check(

@@ -3,7 +3,7 @@
 from itertools import chain, zip_longest
 
 from adaptune.odometry.portfolio import PortfolioError, path_of, read_portfolio
-from adaptune.odometry.registry import ODOMETRIES, declare, odometry_class
+from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace, PooledSpace
 from adaptune.study.config import StudyConfig
 
@@ -29,8 +29,7 @@ def portfolio_sets(
             continue
         one = config.odometries[label]
         own = space.spaces[label] if isinstance(space, PooledSpace) else space
-        described = declare(one.name, one.settings).description
-        known = {*own.names, *((described and described.space) or own).names}
+        known = {*own.names, *(one.declared[1].space or own).names}
         known |= {*odometry_class(one.name).space.names} if one.name in ODOMETRIES else set()
         try:
             sets, more = portfolio.fitting(own, known)

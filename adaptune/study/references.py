@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -29,8 +29,8 @@ _AS_RECORDED = {"compensate": None}
 _WHOLE = {"part": None}
 _MOST = 0.5
 """Parts that are a larger share of a recording take theirs from that of the whole."""
-_newest: dict[str, EstimatedReference | str] = {}
-"""The last estimate of a whole recording, or why there is none."""
+_wholes: dict[str, EstimatedReference | str] = {}
+"""Estimates of whole recordings that were made in this process, or why there is none."""
 KEPT = "references"
 """Folder of the cache that keeps estimates for other studies of the same recordings."""
 
@@ -74,9 +74,6 @@ def ensure_references(
             if required:
                 raise
             refused[name] = str(error)
-        for other in _others_of_newest(sequences):
-            with suppress(EstimateError):
-                _ensure(sequences, other, length, lambda *_: None)
     return refused
 
 
@@ -121,26 +118,15 @@ def _estimate(
     """The reference of a sequence, or why it cannot be estimated."""
     config = sequences.unseen(name).model_copy(update=_AS_RECORDED)
     if _is_one_of_parts(sequences, config):
-        whole = config.model_copy(update=_WHOLE)
-        if _key(sequences, name, whole) not in _newest:
-            _estimated(sequences, name, whole, advance)
-        if (found := _part_of_newest(sequences, name, config)) is not None:
-            return found
+        of_whole = config.model_copy(update=_WHOLE)
+        if (whole := _wholes.get(_key(sequences, name, of_whole))) is None:
+            whole = _estimated(sequences, name, of_whole, advance)
+        within = RecordedSequence(config).holds
+        if isinstance(whole, EstimatedReference) and (inside := within(whole.stamps)).any():
+            found = whole.part(inside)
+            if found.path() >= estimate.SHORTEST and found.unknown_share() < estimate.MOST_UNKNOWN:
+                return found
     return _estimated(sequences, name, config, advance)
-
-
-def _part_of_newest(
-    sequences: StudySequences, name: str, config: SequenceConfig
-) -> EstimatedReference | None:
-    """The reference of a part, if that of the whole was the last to be estimated, and it serves."""
-    whole = _newest.get(_key(sequences, name, config.model_copy(update=_WHOLE)))
-    if not isinstance(whole, EstimatedReference):
-        return None
-    if not (within := RecordedSequence(config).holds(whole.stamps)).any():
-        return None
-    found = whole.part(within)
-    enough = found.path() >= estimate.SHORTEST and found.unknown_share() < estimate.MOST_UNKNOWN
-    return found if enough else None
 
 
 def _estimated(
@@ -166,8 +152,7 @@ def _estimated(
         except EstimateError as error:
             found = str(error) if scans.name in str(error) else f"{scans.name}: {error}"
     if config.part is None:
-        _newest.clear()
-        _newest[key] = found
+        _wholes[key] = found
     return found
 
 
@@ -177,14 +162,6 @@ def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> str:
     scans = about["sequences"][name] | {"part": config.part}
     by = [about["estimator"], about["reader"], *map(package_version, ("small_gicp", "gtsam"))]
     return manifest.digest([*by, about["recording"][name], scans])
-
-
-def _others_of_newest(sequences: StudySequences) -> Iterator[str]:
-    """Sequences whose reference follows from the last estimate: another process lacks that."""
-    for name in to_estimate(sequences, sequences.recordings) if _newest else ():
-        config = sequences.unseen(name).model_copy(update=_AS_RECORDED)
-        if _is_one_of_parts(sequences, config) and _part_of_newest(sequences, name, config):
-            yield name
 
 
 def _is_one_of_parts(sequences: StudySequences, config: SequenceConfig) -> bool:

@@ -18,10 +18,9 @@ from adaptune.files import locked, write_text
 from adaptune.machine import available
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import descriptor_content
-from adaptune.odometry.base import Description, OwnFile
+from adaptune.odometry.base import OwnFile
 from adaptune.odometry.factory import Factory, OdometryFactory, OdometryPool
-from adaptune.odometry.registry import declare
-from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.space import ParameterSet
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.portfolios import portfolio_sets
@@ -89,7 +88,7 @@ class Study(Generic[C_co]):
         """The sequences by name."""
         config = self.config
         layout: Any = "bag"
-        declared = [declared_odometry(one) for one in config.odometries.values()]
+        declared = [one.declared for one in config.odometries.values()]
         for settings, described in declared:
             # A program that runs whole recordings is the only odometry.
             if described.whole:
@@ -114,11 +113,11 @@ class Study(Generic[C_co]):
         return sets
 
     def _factory(self, config: OdometryConfig) -> OdometryFactory:
-        settings, described = declared_odometry(config)
+        settings, described = config.declared
         return OdometryFactory(
             config.name,
             settings,
-            tuned_space(config, described),
+            config.space,
             self.config.isolation,
             self.sequences.program_input if described.whole else None,
         )
@@ -273,30 +272,6 @@ class Study(Generic[C_co]):
         given = resolved["odometry"]
         entries = given if isinstance(given, list) else [given]
         for entry, config in zip(entries, self.config.odometries.values(), strict=True):
-            made = self._factory(config)
-            entry["settings"] = made.settings.model_dump(mode="json")
-            entry["parameters"] = made.space.definition()
+            entry["settings"] = config.declared[0].model_dump(mode="json")
+            entry["parameters"] = config.space.definition()
         return resolved
-
-
-def declared_odometry(config: OdometryConfig) -> tuple[Any, Description]:
-    """The odometry's settings, and its description with them."""
-    return declare(config.name, config.settings).sound(config.name)
-
-
-def tuned_space(config: OdometryConfig, described: Description) -> ParameterSpace:
-    """The parameters that are tuned: those that the study names, by default all."""
-    own = described.space
-    if config.parameters is None:
-        return own or ParameterSpace({})
-    definitions = config.parameters.items()
-    return ParameterSpace.load({name: whole_definition(own, name, d) for name, d in definitions})
-
-
-def whole_definition(
-    space: ParameterSpace | None, name: str, given: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Definition of a parameter: the study's values, and the odometry's own for the rest."""
-    own = {} if space is None else space.parameters[name].model_dump()
-    other = given.get("type", own.get("type")) != own.get("type")
-    return dict(given) if other else own | dict(given)

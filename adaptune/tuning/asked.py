@@ -8,19 +8,24 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from adaptune import processes
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name
+from adaptune.manifest import plain
+from adaptune.odometry import Odometry, registry
+from adaptune.odometry.content import module_file
 from adaptune.progress import Progress
-
-if TYPE_CHECKING:
-    from adaptune.recording.fleet import Reading
-    from adaptune.recording.inspect import Inspection
+from adaptune.recording.clouds import CLOUDS
+from adaptune.recording.config import NO_REFERENCE
+from adaptune.recording.fleet import Reading, check_alike, recordings_at
+from adaptune.recording.inspect import Inspection
+from adaptune.recording.inspect import inspect as inspect_file
+from adaptune.reference.estimate import recording_config
+from adaptune.study.config import read_budget
 
 _log = logging.getLogger(__name__)
-TRIALS, EACH = 32, 16
-"""Parameter sets to try, and at least for each of several odometries."""
 
 
 class Asked(NamedTuple):
@@ -32,7 +37,7 @@ class Asked(NamedTuple):
     reference: str | None = None
     config: Path | None = None  # the user's parameter file
     test: Sequence[Path] = ()
-    reading: "Reading | None" = None
+    reading: Reading | None = None
     about: Mapping[str, Any] = {}  # by odometry, its settings and parameters, if given
     trials: int | None = None
     minutes: float | None = None
@@ -44,14 +49,10 @@ class Asked(NamedTuple):
         """What may be spent, by its keys in a study."""
         hours = None if self.minutes is None else self.minutes / 60.0
         limits: dict[str, Any] = {"offline.trials": self.trials, "offline.hours": hours}
-        from adaptune.manifest import plain
-        from adaptune.study.config import read_budget
-
         try:
             limits |= {"online.budget": read_budget(self.budget)}
         except ValueError as error:
             raise AdaptuneError(f"--budget {self.budget}: {error}") from error
-
         return dict(plain({key: v for key, v in limits.items() if v is not None}))
 
     @property
@@ -59,8 +60,6 @@ class Asked(NamedTuple):
         """The rest as plain data, by which a study is known."""
         found = self._asdict() | {"config": self.config and str(self.config.resolve())}
         found |= {key: [str(p.resolve()) for p in found[key]] for key in ("recordings", "test")}
-        from adaptune.manifest import plain
-
         spelt = {"reading": "--as", "about": "the odometry's object", "recordings": "BAG"}
         limits = ("trials", "minutes", "budget")
         return dict(plain({spelt.get(k, f"--{k}"): v for k, v in found.items() if k not in limits}))
@@ -85,14 +84,11 @@ def check_no_study(path: Path) -> None:
 
 def recorded(
     asked: Asked, show: Progress, alike: bool = True
-) -> "tuple[dict[str, Inspection], list[str]]":
+) -> tuple[dict[str, Inspection], list[str]]:
     """The recordings by the names of their sequences, and the names of those for the test.
 
     They are `alike`, see `check_alike`, where they tune one odometry.
     """
-    from adaptune.recording.config import NO_REFERENCE
-    from adaptune.recording.fleet import check_alike, recordings_at
-
     for path in asked.recordings:
         check_no_study(path)
     tested, others = (recordings_at(p, asked.reading) for p in (asked.test, asked.recordings))
@@ -127,12 +123,8 @@ def recorded(
     return named, list(named)[len(paths) - len(tested) :]
 
 
-def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
+def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> Inspection:
     """Look at a recording; it has scans of one topic, and a reference or is to get one."""
-    from adaptune.recording.clouds import CLOUDS
-    from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.reference.estimate import recording_config
-
     check_no_study(path)
     found = inspect_file(path, False, show)
     clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
@@ -151,8 +143,6 @@ def usable(path: Path, points: str | None, reference: str | None, show: Progress
 
 def check_guarded(function: str) -> None:
     """Refuse to begin again in a process that was started by the same script."""
-    from adaptune import processes  # takes long to import
-
     started = getattr(sys.modules["__main__"], "__spec__", None)
     imported = started is not None and started.name == processes.__name__
     if imported or getattr(multiprocessing.current_process(), "_inheriting", False):
@@ -174,16 +164,12 @@ def named_odometry(given: Any) -> tuple[str, dict[str, Any]]:
         each = [named_odometry(one) for one in given]
         about = {name: settings for _, of in each for name, settings in of.items()}
         return ",".join(name for name, _ in each), about
-    from adaptune.odometry import Odometry
-    from adaptune.odometry.content import module_file
-    from adaptune.odometry.registry import ODOMETRIES
-
     cls = given if isinstance(given, type) else type(given)
     module, main = cls.__module__, getattr(sys.modules["__main__"], "__file__", None)
     if module == "__main__" and main and (file := module_file(Path(main).stem)):
         module = Path(main).stem if file.resolve() == Path(main).resolve() else module
     path = f"{module}:{cls.__qualname__}"
-    name = next((name for name, where in ODOMETRIES.items() if where == path), path)
+    name = next((name for name, where in registry.ODOMETRIES.items() if where == path), path)
     if isinstance(given, type):
         return name, {}
     if not isinstance(given, Odometry):
@@ -198,8 +184,6 @@ def named_odometry(given: Any) -> tuple[str, dict[str, Any]]:
 
 def odometries_of(given: str, imu: bool) -> list[str]:
     """The odometries that a name, several, or `all` stand for."""
-    from adaptune.odometry import registry
-
     if given != "all":
         names = list(dict.fromkeys(filter(None, map(str.strip, given.split(",")))))
         if programs := [name for name in names if name in registry.PROGRAMS]:

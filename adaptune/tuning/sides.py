@@ -6,27 +6,31 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.machine import pin
+from adaptune.manifest import digest, plain
+from adaptune.odometry import Odometry
+from adaptune.odometry.base import ToolSettings
+from adaptune.odometry.registry import is_user_class, odometry_class
 from adaptune.progress import Progress, bars_and_words
+from adaptune.recording.fleet import Reading
+from adaptune.reference.check import greatest_speed
 from adaptune.space import in_words
+from adaptune.study.references import ensure_references
 from adaptune.tuning.asked import Asked, check_guarded, named_odometry, recorded, words_of
 from adaptune.tuning.studies import is_image
-from adaptune.yaml12 import Document, YamlError
-
-if TYPE_CHECKING:
-    from adaptune.odometry import Odometry
-    from adaptune.recording.fleet import Reading
-    from offline.config import OfflineStudy
-    from online.gate import Gate, Shared, Side
-    from online.turns import Costs
+from adaptune.yaml12 import Document
+from offline.config import OfflineStudy, load_study
+from online.gate import Gate, Shared, Side, compare_sides, shared_replays
+from online.modes import BASELINE, replay_modes, sequences_without_model
+from online.turns import Costs, by_turns
 
 _log = logging.getLogger(__name__)
 FOLDER = Path("runs/compare")
@@ -40,20 +44,16 @@ Lengths that suit the recordings would change with each that is added, and with 
 
 def sides(
     given: Sequence[Any], asked: Asked, length: float | None, show: Progress
-) -> "tuple[Side, Side]":
+) -> tuple[Side, Side]:
     """The replays of both sides, the new one first; those that are missing are made.
 
     See `compare` for what a side is. They are driven by turns, each alone on a core. `length` is
     that of sub-trajectories; by default the studies', or `CAR` or `ROBOT`.
     """
-    from online.gate import Side
-
     called, now = [*map(_called, given)], time.time()
     studies = _driven(given, asked, show) if asked.recordings else _studies(called)
     _drive(studies, called, show)
-    if length is not None:
-        over = {"sub_trajectory": length}
-        studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
+    studies = studies if length is None else [_over(length, one) for one in studies]
     for name, study in zip(called, studies, strict=True):
         made = [path.stat().st_mtime for path in study.folder.glob("replays/*/*/replay.json")]
         if made and (first := min(made)) < now:
@@ -74,19 +74,19 @@ def _called(given: Any) -> str:
 
 
 def compare(
-    new: "str | Path | type[Odometry] | Odometry",
-    old: "str | Path | type[Odometry] | Odometry",
+    new: str | Path | type[Odometry] | Odometry,
+    old: str | Path | type[Odometry] | Odometry,
     recordings: "str | Path | Sequence[str | Path]" = (),
     *,
     odometry: str = "",
     points: str | None = None,
     reference: str | Path | None = None,
-    reading: "Reading | None" = None,
+    reading: Reading | None = None,
     sub_trajectory: float | None = None,
     worse: float = 5.0,
     cost: float | None = 10.0,
     progress: Progress | None = None,
-) -> "Gate":
+) -> Gate:
     """Say whether an odometry is worse than another, as ``compare NEW --against OLD`` does.
 
     The result's `verdict` is ``"worse"``, ``"equal"``, ``"better"`` or ``"unclear"``, its `words`
@@ -110,8 +110,6 @@ def compare(
     progress
         Called with how far each task is; by default, bars show it.
     """
-    from online.gate import compare_sides, shared_replays
-
     check_guarded("compare")
     bags = [recordings] if isinstance(recordings, str | Path) else recordings
     judge = None if reference is None else str(reference)
@@ -125,10 +123,8 @@ def compare(
     return compare_sides(shared, measured, worse / 100.0, bound)
 
 
-def costs(shared: "Shared", show: Progress) -> "dict[str, Costs | str]":
+def costs(shared: Shared, show: Progress) -> dict[str, Costs | str]:
     """What both sides cost on each recording, driven twice by turns; or why that is not known."""
-    from online.turns import by_turns
-
     found: dict[str, Costs | str] = {}
     for pair in shared.pairs:
         found[pair.name] = next(filter(None, (one.obstacle for one in pair.both)), "")
@@ -140,28 +136,15 @@ def costs(shared: "Shared", show: Progress) -> "dict[str, Costs | str]":
     return found
 
 
-def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
-    from offline.config import load_study
-
+def _studies(given: Sequence[str]) -> list[OfflineStudy]:
     for name in given:
-        if not (path := Path(name)).exists():
+        if not Path(name).exists():
             raise AdaptuneError(f"{name}: there is no such study; or name the bags to drive, too")
-        with suppress(YamlError):
-            data = Document.of_file(path).data if path.is_file() else {"odometry": ""}
-            if not isinstance(data, dict) or "odometry" not in data:
-                raise AdaptuneError(
-                    f"{name}: is no study; of a parameter file, name the bags and --odometry, too"
-                )
     return [load_study(name, needed=Path(name).is_file()) for name in given]
 
 
-def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> "list[OfflineStudy]":
+def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> list[OfflineStudy]:
     """Both sides as studies of the same recordings."""
-    from adaptune.manifest import digest
-    from adaptune.reference.check import greatest_speed
-    from adaptune.study.references import ensure_references
-    from offline.config import load_study
-
     named, _ = recorded(asked, show, alike=False)  # nothing is tuned on them
     names = list(named)
     shared: dict[str, Any] = {
@@ -173,23 +156,24 @@ def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> "list[Offline
     for side, entry in zip(given, entries, strict=True):
         about = side if isinstance(side, str) else entry
         folders.append(FOLDER / f"{plain_name(Path(_called(side)))[:40]}_{digest(about)[:6]}")
-    first = load_study(shared | {"odometry": entries[0]}, folder=folders[0])
-    first.open()
-    refused = ensure_references(first.sequences, names, 5.0, show, required=False)
-    known = [first.sequences.open(name).reference() for name in names if name not in refused]
+    each = zip(entries, folders, strict=True)
+    both = [load_study(shared | {"odometry": of}, folder=folder) for of, folder in each]
+    both[0].open()
+    sequences = both[0].sequences
+    refused = ensure_references(sequences, names, 5.0, show, required=False)
+    known = [sequences.open(name).reference() for name in names if name not in refused]
     fastest = max((greatest_speed(one) for one in known if one is not None), default=0.0)
-    shared["sub_trajectory"] = CAR if fastest > FAST else ROBOT
     if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
         shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
-    both = zip(entries, folders, strict=True)
-    return [load_study(shared | {"odometry": of}, folder=folder) for of, folder in both]
+    return [_over(CAR if fastest > FAST else ROBOT, one) for one in both]
+
+
+def _over(length: float, study: OfflineStudy) -> OfflineStudy:
+    """The study with errors over another length."""
+    return replace(study, config=study.config.model_copy(update={"sub_trajectory": length}))
 
 
 def _entry(given: Any, odometry: str) -> dict[str, Any]:
-    from adaptune.manifest import plain
-    from adaptune.odometry.base import ToolSettings
-    from adaptune.odometry.registry import is_user_class, odometry_class
-
     if not isinstance(given, str):
         name, about = named_odometry(given)
         return {"name": name, **plain(about.get(name, {}))}
@@ -228,13 +212,11 @@ def _named(given: str) -> dict[str, Any]:
     return {"name": given}
 
 
-def _drive(studies: "Sequence[OfflineStudy]", called: Sequence[str], show: Progress) -> None:
+def _drive(studies: Sequence[OfflineStudy], called: Sequence[str], show: Progress) -> None:
     """Make the replays of the baselines that are missing, of a study that is a file.
 
     Both sides take turns on each recording, so that both meet the same state of the machine.
     """
-    from online.modes import BASELINE, replay_modes, sequences_without_model
-
     due = [
         (name, side, study)
         for side, study in zip(called, studies, strict=True)

@@ -4,23 +4,34 @@ import logging
 import re
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from itertools import count
+from itertools import count, product
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
+from adaptune.metrics import travelled
+from adaptune.odometry import registry
+from adaptune.odometry.portfolio import ScanKind, portfolios_of, read_portfolio
 from adaptune.progress import Progress, about
-from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded, words_of
+from adaptune.recording.config import ESTIMATED, SOURCES
+from adaptune.recording.fleet import recordings_at
+from adaptune.recording.inspect import Inspection
+from adaptune.recording.recording import open_sequence
+from adaptune.reference import check
+from adaptune.reference.carried import begin_of, without
+from adaptune.trajectory import Trajectory, read_trajectory
+from adaptune.tuning import EACH, TRIALS
+from adaptune.tuning.asked import Asked, odometries_of, recorded, words_of
 from adaptune.yaml12 import Document, YamlError, YamlPath, dump
 
 if TYPE_CHECKING:
-    from adaptune.recording.inspect import Inspection
-    from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
 
 _log = logging.getLogger(__name__)
@@ -70,12 +81,10 @@ def roles(
     Without a `test`, what follows after a `share` of the duration of a single recording is kept for
     it; of several, the last one.
     """
-    from adaptune.reference.check import TRAINING
-
     training: list[Any] = list(names)
     tested: list[Any] = list(test)
     if not test and len(names) == 1:
-        end = f"{100 * (share or TRAINING):.0f}"
+        end = f"{100 * (share or check.TRAINING):.0f}"
         training, tested = [{names[0]: f"0-{end}%"}], [{names[0]: f"{end}-100%"}]
     elif not test:
         *training, last = names
@@ -91,7 +100,7 @@ def undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) -
             recording.given["compensate"] = "constant_velocity"
 
 
-def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | None, float, str]:
+def proposed(found: Inspection, deep: bool, show: Progress) -> tuple[float | None, float, str]:
     """The split to propose, the length of sub-trajectories, and how wrong the reference is.
 
     Only what can be used to train is measured. What the scans say against it joins the findings.
@@ -100,15 +109,7 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         undo_motion([found], ["gicp"])
     if found.reference is None or len(found.reference) < 2 or found.missing.get("offline"):
         return None, USUAL_LENGTH, ""
-    from adaptune.recording.recording import open_sequence
-    from adaptune.reference import check
-    from adaptune.reference.carried import begin_of, without
-    from adaptune.reference.diagnosis import (
-        SUSPICIOUS,
-        UNEXPLAINED,
-        diagnose_reference,
-        measured_motions,
-    )
+    from adaptune.reference import diagnosis
 
     share = share_of(found.reference)
     usual = check.proposed_sub_trajectory(found.reference, training=share)
@@ -121,29 +122,32 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         measured = check.measure_reference(scans, reference, partial(show, "registering"))
         found.findings += measured.carried
         reference = without(reference, measured.carried, begin_of(scans, measured.stamps))
-        motions = measured_motions(scans, len(measured.stamps))
-        if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
+        motions = diagnosis.measured_motions(scans, len(measured.stamps))
+        if (cause := diagnosis.diagnose_reference(reference, measured.stamps, motions)) is not None:
             found.findings.append(cause.below((check.CONTRADICTS,)))
     except AdaptuneError as why:
         return share, usual, f"its error cannot be measured: {why}"
     length = check.proposed_sub_trajectory(reference, measured, share)
     accuracy, error = check.accuracy_words(measured, usual, length), measured.error(length)
-    if cause is None and not measured.doubt and error is not None and error.low > SUSPICIOUS:
-        accuracy += UNEXPLAINED
+    if cause is None and not measured.doubt and error and error.low > diagnosis.SUSPICIOUS:
+        accuracy += diagnosis.UNEXPLAINED
     words = accuracy, check.advice(measured, reference, share)
     return share, length, "; ".join(filter(None, words))
 
 
 def written(
     asked: Asked, overrides: Sequence[str], folder: Path, show: Progress
-) -> tuple[Path, list[str], list[str]]:
-    """Write the study, or add what is new to the one that is there; its overrides are checked.
+) -> tuple["OfflineStudy", list[str]]:
+    """The study, which is written, or to whose file is added what is new.
 
-    Returns its file, what overrides it, and the names of new recordings.
+    It has the overrides, which the file has not. Returns the names of new recordings, too.
     """
+    from offline.config import load_study
+
     path, known = folder / f"{folder.resolve().name}.yaml", folder / ASKED
     if not path.exists():
-        text = dump(_decided(asked, overrides, folder, show), _COMMENTS)
+        made = _decided(asked, overrides, folder, show)
+        study, text = load_study(made, overrides, folder), dump(made, _COMMENTS)
         try:
             manifest.record(known, asked.inputs)
             write_text(path, text)
@@ -152,7 +156,8 @@ def written(
                 f"{folder}: cannot be written to ({error.strerror}); name another folder with "
                 f"--folder"
             ) from error
-        return path, [], []
+        _log.info("study: %s", path)
+        return study, []
     if (before := manifest.recorded(known)) is None:
         raise AdaptuneError(
             f"{path}: {ASKED} beside it is gone, or an older adaptune made it; `adaptune offline "
@@ -165,22 +170,21 @@ def written(
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
             f"resume it, or tune in a folder of its own with `--folder {free}`"
         )
-    limits = [f"{key}={value}" for key, value in asked.limits.items()]
-    return path, limits, _grown(path, asked, show)
+    new = _grown(path, asked, show)
+    limits = (f"{key}={value}" for key, value in asked.limits.items())
+    return load_study(path, [*overrides, *limits], folder), new
 
 
 def _decided(
     asked: Asked, overrides: Sequence[str], folder: Path, show: Progress
 ) -> dict[str, Any]:
-    """The study of some recordings; nothing is written but references."""
-    from adaptune.odometry.registry import declare
+    """What the study of some recordings says; nothing is written but references."""
     from offline.config import load_study
 
-    begin_of_search([], asked.portfolio)
+    portfolios_of((), asked.portfolio)  # a wrong one is known before all is read
     about = {name: manifest.plain(given) for name, given in asked.about.items()}
     for name in odometries_of(asked.odometry, True):
-        # A wrong one is known before all is read.
-        declare(name, about.get(name, {}).get("settings", {}))
+        registry.declare(name, about.get(name, {}).get("settings", {}), folder.resolve())
     named, test = recorded(asked, show)
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
     if asked.config is not None and about:
@@ -188,13 +192,15 @@ def _decided(
     if asked.config is not None and len(odometries) != 1:
         raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
     undo_motion([*named.values()], odometries)
-    begin = begin_of_search(odometries, asked.portfolio, named)
+    portfolios = portfolios_of(odometries, asked.portfolio)
+    _tell_unlike(portfolios, named)
     entries: list[Any] = [{"name": n, **about.get(n, {})} for n in odometries]
     if asked.config is not None:
         entries[0]["settings"] = {"config": str(asked.config.resolve())}
     if asked.trials is None and asked.minutes is None:
         asked = asked._replace(trials=max(TRIALS, EACH * len(odometries)))
-    spent: dict[str, dict[str, Any]] = {"offline": {}, "online": {"modes": ["adaptive"]}} | begin
+    begin: dict[str, Any] = {"portfolio": portfolios} if portfolios else {}
+    spent: dict[str, dict[str, Any]] = {"offline": begin, "online": {"modes": ["adaptive"]}}
     for key, value in asked.limits.items():
         stage, _, name = key.partition(".")
         spent[stage][name] = value
@@ -205,51 +211,32 @@ def _decided(
         sequences = {name: dict(recording.given) for name, recording in named.items()}
         return {"sequences": sequences, **roles(rest, length, odometry, share, test)} | spent
 
-    def loaded() -> "OfflineStudy":
-        of_recordings = [given for given in overrides if given.startswith("sequences.")]
-        return load_study(study(USUAL_LENGTH), of_recordings, folder)
-
     # An error comes before all is measured: what is wrong with the least parts is so with all.
     least = study(USUAL_LENGTH, LEAST_SHARE), study(USUAL_LENGTH, 1.0 - LEAST_SHARE)
-    load_study(least[0] | {"test": least[1]["test"]}, overrides, folder)
-    if asked.reference is None:
-        _replace_noisy(named, loaded, show)
-    length, share, speed = _split(loaded(), list(named), show)
-    made = study(length, share) | {"health": {"max_speed": speed}}
-    load_study(made, overrides, folder)
-    return made
+    draft = load_study(least[0] | {"test": least[1]["test"]}, overrides, folder)
+    for name, one in named.items() if asked.reference is None else ():
+        insisted = draft.config.sequences[name].reference != one.given.get("reference")
+        if not insisted and (estimated := _less_noisy(draft, name, show)) is not None:
+            draft, one.given["reference"] = estimated, ESTIMATED
+    length, share, speed = _split(draft, list(named), show)
+    return study(length, share) | {"health": {"max_speed": speed}}
 
 
-def begin_of_search(
-    odometries: Sequence[str],
-    given: str | None = None,
-    recordings: "Mapping[str, Inspection]" = MappingProxyType({}),
-) -> dict[str, dict[str, Any]]:
-    """The portfolios that a search begins with, as a study names them, if there are any.
-
-    A file, or `none`, may be `given`. It is told where a recording is unlike what they know.
-    """
-    from adaptune.odometry.portfolio import ScanKind, portfolios_of, read_portfolio
-
-    found = portfolios_of(odometries, given)
-    for portfolio in map(read_portfolio, found):
-        for name, one in recordings.items():
-            topic = one.topics.get(one.used.get("points", ""))
-            if topic is None or one.scan is None or not topic.rate:
-                continue
-            if what := portfolio.unlike(ScanKind.of(one.scan, topic.rate)):
-                _log.warning(
-                    f"{name}: its scans are unlike those that the portfolio of "
-                    f"{portfolio.odometry} was chosen on: {what}. It says little here"
-                )
-    return {"offline": {"portfolio": found}} if found else {}
+def _tell_unlike(portfolios: Iterable[str], recordings: Mapping[str, Inspection]) -> None:
+    """Tell where a recording is unlike what portfolios know."""
+    for portfolio, (name, one) in product(map(read_portfolio, portfolios), recordings.items()):
+        topic = one.topics.get(one.used.get("points", ""))
+        if topic is None or one.scan is None or not topic.rate:
+            continue
+        if what := portfolio.unlike(ScanKind.of(one.scan, topic.rate)):
+            _log.warning(
+                f"{name}: its scans are unlike those that the portfolio of "
+                f"{portfolio.odometry} was chosen on: {what}. It says little here"
+            )
 
 
 def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     """Add the recordings that a study does not name yet to where they belong; their names."""
-    from adaptune.recording.config import SOURCES
-    from adaptune.recording.fleet import recordings_at
-
     try:
         document = Document.of_file(path)
         data: Any = document.data
@@ -259,22 +246,23 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         offline: dict[str, Any] = {} | (data.get("offline") or {})
     except (YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
-    tested = [bag.resolve() for bag in recordings_at(asked.test, asked.reading)]
-    others = [bag.resolve() for bag in recordings_at(asked.recordings, asked.reading)]
-    there = list(dict.fromkeys([*others, *tested]))
-    new = [bag for bag in there if known.isdisjoint({str(bag), str(bag.parent)})]
-    if not new:
+
+    def is_new(bag: Path) -> bool:
+        return known.isdisjoint(map(str, (bag.resolve(), bag.resolve().parent)))
+
+    there = recordings_at([*asked.recordings, *asked.test], asked.reading)
+    if not any(map(is_new, there)):
         return []
-    named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"), show)
+    named, test = recorded(asked, show)
     undo_motion([*named.values()], odometries_of(asked.odometry, False))
-    added = {name: recording for name, recording in named.items() if recording.path in new}
+    added = {name: recording for name, recording in named.items() if is_new(recording.path)}
     if taken := [name for name in added if name in data["sequences"]]:
         raise AdaptuneError(
             f"{path}: sequences.{taken[0]} is another recording; rename the new one"
         )
     into: dict[str, list[str]] = {
-        "training": [name for name, recording in added.items() if recording.path not in tested],
-        "test": [name for name, recording in added.items() if recording.path in tested],
+        "training": [name for name in added if name not in test],
+        "test": [name for name in added if name in test],
     }
     new_of = {name: recording.given for name, recording in added.items()}
     more: dict[YamlPath, Any] = {("sequences",): new_of} | {(r,): n for r, n in into.items() if n}
@@ -291,37 +279,34 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     return list(added)
 
 
-def _replace_noisy(
-    named: "Mapping[str, Inspection]", loaded: "Callable[[], OfflineStudy]", show: Progress
-) -> None:
-    """Let references be estimated that are surely noisier than estimates of them."""
-    from adaptune.recording.recording import open_sequence
-    from adaptune.reference.check import measure_reference, proposed_sub_trajectory
-
-    for name, one in named.items():
-        scans = open_sequence(one.config())
-        if "estimated" in one.given.values() or (reference := scans.reference()) is None:
-            continue
-        length = proposed_sub_trajectory(reference, training=share_of(reference))
-        measured = measure_reference(scans, reference, partial(show, "registering"))
-        if not measured.is_noisy(length) or (error := measured.error(length)) is None:
-            continue
-        before, one.given = one.given, one.given | {"reference": "estimated"}
-        try:
-            study = loaded()
-            _estimate(study, [name], show)
-            own = study.sequences.estimate(name)
-            if own is not None and own.error(length) < error.low:
-                _log.warning(
-                    f"{name}: its reference is wrong by {error.mean:.2g} % ({error.low:.2g}-"
-                    f"{error.high:.2g}) over {length:g} m, as registrations of scans tell; an "
-                    f"estimated one, by {own.error(length):.2g} %, judges instead. To insist: "
-                    f"`--reference {before.get('reference', 'FILE')}`"
-                )
-                continue
-        except AdaptuneError as why:
-            _log.warning("%s: its reference is noisy, and none can be estimated: %s", name, why)
-        one.given = before
+def _less_noisy(study: "OfflineStudy", name: str, show: Progress) -> "OfflineStudy | None":
+    """The study with an estimated reference of a sequence, if its own is surely noisier."""
+    config = study.config.sequences[name]
+    scans = open_sequence(config)
+    if (reference := scans.reference()) is None:
+        return None
+    length = check.proposed_sub_trajectory(reference, training=share_of(reference))
+    measured = check.measure_reference(scans, reference, partial(show, "registering"))
+    if not measured.is_noisy(length) or (error := measured.error(length)) is None:
+        return None
+    estimated = config.model_copy(update={"reference": ESTIMATED})
+    every = {"sequences": {**study.config.sequences, name: estimated}}
+    study = replace(study, config=study.config.model_copy(update=every))
+    try:
+        _estimate(study, [name], show)
+    except AdaptuneError as why:
+        _log.warning("%s: its reference is noisy, and none can be estimated: %s", name, why)
+        return None
+    own = study.sequences.estimate(name)
+    if own is None or own.error(length) >= error.low:
+        return None
+    _log.warning(
+        f"{name}: its reference is wrong by {error.mean:.2g} % ({error.low:.2g}-"
+        f"{error.high:.2g}) over {length:g} m, as registrations of scans tell; an "
+        f"estimated one, by {own.error(length):.2g} %, judges instead. To insist: "
+        f"`--reference {config.reference or 'FILE'}`"
+    )
+    return study
 
 
 def _split(
@@ -333,9 +318,6 @@ def _split(
     know. A reference that is lacking is estimated: it tells how far the robot has moved. `whole`
     has the names of the recordings.
     """
-    from adaptune.reference.check import greatest_speed, path_after, proposed_sub_trajectory
-    from adaptune.trajectory import read_trajectory
-
     sequences = study.sequences
     known = {n: one for n in whole if (one := sequences.open(n).reference()) is not None}
     reference = known.get(whole[-1])
@@ -343,7 +325,7 @@ def _split(
         _estimate(study, whole[-1:], show)
         reference = read_trajectory(sequences.estimate_path(whole[-1]))
     share = share_of(reference) if len(whole) == 1 else 0.0
-    metres, _ = path_after(reference, share)
+    metres, _ = check.path_after(reference, share)
     if metres < LEAST_PATH:
         raise AdaptuneError(
             f"{whole[-1]}: moves {metres:.1f} m in the part for the test, which takes "
@@ -352,25 +334,20 @@ def _split(
         )
     others = [one for name, one in known.items() if name != whole[-1]]
     # One that fits into each of several.
-    lengths = [proposed_sub_trajectory(other, training=0.0) for other in others]
-    length = min([proposed_sub_trajectory(reference, training=share), *lengths])
-    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known.values(), reference])))
+    lengths = [check.proposed_sub_trajectory(other, training=0.0) for other in others]
+    length = min([check.proposed_sub_trajectory(reference, training=share), *lengths])
+    speed = max(LEAST_SPEED, 2.0 * max(map(check.greatest_speed, [*known.values(), reference])))
     return length, share, float(round(speed))
 
 
-def share_of(reference: "Trajectory") -> float:
+def share_of(reference: Trajectory) -> float:
     """Share of a recording's duration to train on: of its path, where it stands for long."""
-    import numpy as np
-
-    from adaptune.metrics import travelled
-    from adaptune.reference.check import TRAINING
-
     metres = travelled(reference.T_world_sensor)
     time = (reference.stamps - reference.stamps[0]) / np.ptp(reference.stamps)
-    of_path = float(np.interp(TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
-    if abs(of_path - TRAINING) <= UNEVEN:
-        return TRAINING
-    share = np.interp(TRAINING * metres[-1], metres, time)
+    of_path = float(np.interp(check.TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
+    if abs(of_path - check.TRAINING) <= UNEVEN:
+        return check.TRAINING
+    share = np.interp(check.TRAINING * metres[-1], metres, time)
     return round(float(np.clip(share, LEAST_SHARE, 1.0 - LEAST_SHARE)), 2)
 
 
@@ -436,7 +413,6 @@ def _system_of(given: str) -> dict[str, Any] | None:
 
 def is_image(given: str) -> bool:
     """Whether a name is that of an image, and of no odometry."""
-    from adaptune.odometry import registry
     from adaptune.odometry.docker.engine import EngineError, image_digest
 
     of_odometry = given in {*registry.ODOMETRIES, *registry.PROGRAMS, "all"}

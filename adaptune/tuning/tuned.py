@@ -5,28 +5,33 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
+from adaptune.odometry import Odometry
+from adaptune.odometry.registry import forget_user_code
 from adaptune.progress import Progress, bars_and_words
+from adaptune.recording.fleet import Reading
+from adaptune.report.page import FIGURES
+from adaptune.space import ParameterSet
 from adaptune.tuning.asked import Asked, check_guarded, named_odometry
+from adaptune.tuning.page import write_study_page
 from adaptune.tuning.studies import written
-
-if TYPE_CHECKING:
-    from adaptune.odometry import Odometry
-    from adaptune.recording.fleet import Reading
-    from adaptune.space import ParameterSet
-    from offline.config import OfflineStudy
-    from offline.search import Stopwatch
-    from offline.train import Training
-    from online.compare import ComparedReplays
-
-    One = str | type[Odometry] | Odometry
+from adaptune.tuning.verdict import write_verdict
+from offline.config import OfflineStudy
+from offline.scenario import scenario
+from offline.search import ELAPSED, Stopwatch
+from offline.train import Training, odometry_rows, train
+from online.compare import ComparedReplays, compare
+from online.modes import BASELINE, FIXED, replay_modes, run_replays
+from online.statistics import ALL
 
 _log = logging.getLogger(__name__)
 Paths = str | Path | Sequence[str | Path]
+One = str | type[Odometry] | Odometry
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,12 +42,12 @@ class Tuned:
     dict of columns.
     """
 
-    study: "OfflineStudy"
-    training: "Training"
-    comparison: "ComparedReplays"
+    study: OfflineStudy
+    training: Training
+    comparison: ComparedReplays
     page: Path  # HTML, with all charts and tables
     more: Sequence[str] = ()  # recordings that the study did not name before
-    before: "ParameterSet | None" = None  # the fixed set before, where there was one
+    before: ParameterSet | None = None  # the fixed set before, where there was one
     of_each: Sequence[Mapping[str, Any]] = ()  # see `odometries`
 
     @property
@@ -51,7 +56,7 @@ class Tuned:
         return " ".join(self.comparison.verdict)
 
     @property
-    def fixed(self) -> "ParameterSet":
+    def fixed(self) -> ParameterSet:
         """The fixed set; the verdict says whether to drive it."""
         sets = self.training.model.sets
         return sets[self.training.model.fixed]
@@ -76,8 +81,6 @@ class Tuned:
 
         The `attrs` of the data frame have each column's parameters.
         """
-        from offline.scenario import scenario
-
         found = scenario(self.study)
         table = _table(found.columns())
         if hasattr(table, "attrs"):
@@ -117,10 +120,6 @@ class Tuned:
 
     def _repr_html_(self) -> str:
         """Its verdict, the picture of the drive on the page, and the front."""
-        from html import escape
-
-        from adaptune.report.page import FIGURES
-
         shown, picture = "", self.page.parent / FIGURES / "overview.png"
         if picture.exists():
             source = f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
@@ -129,14 +128,11 @@ class Tuned:
         return f"<p>{escape(self.verdict)}</p>{shown}{table}"
 
 
-def left_out_rows(training: "Training", comparison: "ComparedReplays") -> list[dict[str, Any]]:
+def left_out_rows(training: Training, comparison: ComparedReplays) -> list[dict[str, Any]]:
     """Errors of the baseline and of what the other recordings recommend on each, the worst first.
 
     For the test, that is the fixed set.
     """
-    from online.modes import BASELINE, FIXED
-    from online.statistics import ALL
-
     rows = comparison.rows
     rte = {(row.sequence, row.mode): row.rte for row in rows if row.sequence != ALL}
     known = [
@@ -168,11 +164,11 @@ def _table(rows: Any) -> Any:
 
 def tune(
     recordings: Paths,
-    odometry: "One | Sequence[One] | None" = None,
+    odometry: One | Sequence[One] | None = None,
     *,
     config: str | Path | None = None,
     test: Paths = (),
-    reading: "Reading | None" = None,
+    reading: Reading | None = None,
     points: str | None = None,
     reference: str | Path | None = None,
     trials: int | None = None,
@@ -236,12 +232,6 @@ def tune_asked(
     show: Progress,
 ) -> Tuned:
     """Do what `tune` does of what was asked."""
-    from adaptune.odometry.registry import forget_user_code
-    from offline.config import load_study
-    from offline.search import ELAPSED, Stopwatch
-    from offline.train import odometry_rows, train
-    from online.modes import BASELINE, FIXED, replay_modes, run_replays
-
     check_guarded("tune")
     forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
@@ -250,9 +240,7 @@ def tune_asked(
         asked = asked._replace(portfolio=str(Path(asked.portfolio).resolve()))
     folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)
-    path, now, more = written(asked, overrides, folder, show)
-    study = load_study(path, [*overrides, *now], folder)
-    _log.info("study: %s", path)
+    study, more = written(asked, overrides, folder, show)
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
@@ -277,7 +265,7 @@ LATE = 1.05
 """Times what is allowed, after which nothing but the comparison is done."""
 
 
-def within(hours: float, clock: "Stopwatch", show: Progress) -> Progress:
+def within(hours: float, clock: Stopwatch, show: Progress) -> Progress:
     """Progress with an OutOfTimeError once the time is up."""
 
     def shown(text: str, done: float, of: int, remark: str = "", /) -> None:
@@ -302,12 +290,8 @@ def _folder(asked: Asked) -> Path:
     return Path("runs") / (stem if odometry == "gicp" else f"{stem}_{others}")
 
 
-def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":
+def compared(study: OfflineStudy) -> tuple[ComparedReplays, Path]:
     """Compare a study's replays, and write the verdict, and the page, also of one that runs."""
-    from adaptune.tuning.page import write_study_page
-    from adaptune.tuning.verdict import write_verdict
-    from online.compare import compare
-
     try:
         found = compare(study)
     except AdaptuneError as error:

@@ -29,7 +29,7 @@ def study_of(study_file, tmp_path):
 
 
 def test_a_study_of_two(study_of, tmp_path):
-    study = load_study(study_of(TWO), runs=tmp_path)
+    study = load_study(study_of(TWO), folder=tmp_path)
     pool = study.odometry
     assert isinstance(pool, OdometryPool)
     assert pool.name == "gicp, vgicp"

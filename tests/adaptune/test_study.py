@@ -1,4 +1,5 @@
 import sys
+from pathlib import Path
 
 import pytest
 from needs import needs_evalio
@@ -67,13 +68,13 @@ def test_overrides_reach_names_with_dots(study_file, tmp_path):
     text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
     (tmp_path / "s.yaml").write_text(text.replace("one:", "town.v2:").replace("[one", "[town.v2"))
     given = ["sequences.town.v2.stop=2", "sequences.town.v2.extrinsic=[1, 0, 0, 0, 0, 0, 1]"]
-    config = load_study(tmp_path / "s.yaml", given, runs=tmp_path).config.sequences["town.v2"]
+    config = load_study(tmp_path / "s.yaml", given, tmp_path / "run").config.sequences["town.v2"]
     assert (config.stop, config.extrinsic[0]) == (2.0, 1.0)
 
 
-def test_reads_a_study(study_file, tmp_path):
-    study = load_study(study_file, ["odometry.name=gicp", "offline.trials=7"], runs=tmp_path)
-    assert study.folder == tmp_path / "small"
+def test_reads_a_study(study_file):
+    study = load_study(study_file, ["odometry.name=gicp", "offline.trials=7"])
+    assert study.folder == Path("runs/small")
     assert study.config.offline.trials == 7
     assert study.config.sequences["one"].bag == str(study_file.parent / "one.bag")
     assert study.odometry.space.names == ("max_correspondence_distance", "keyframe_interval")

@@ -11,9 +11,11 @@ import pytest
 import rec
 
 from adaptune.commands.tune import say_odometries
+from adaptune.recording.bag import BagSource
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
-from adaptune.tuning import asked, tuned
+from adaptune.study import loading
+from adaptune.tuning import EACH, TRIALS, asked, studies, tuned
 from adaptune.yaml12 import Document
 from offline.config import load_study
 from offline.front import COST
@@ -43,15 +45,17 @@ def bag(study_file, tmp_path):
 
 @pytest.fixture
 def decided(monkeypatch):
-    """Only decide; nothing is run."""
+    """Only decide; nothing is run. The studies that were decided."""
 
-    written = tuned.written
+    written, studies = tuned.written, []
 
     def stop(*given):
-        path, overrides, _ = written(*given)
-        raise tuned.AdaptuneError(f"{path} {' '.join(overrides)}".strip())
+        study, _ = written(*given)
+        studies.append(study)
+        raise tuned.AdaptuneError(str(study.folder / f"{study.name}.yaml"))
 
     monkeypatch.setattr(tuned, "written", stop)
+    return studies
 
 
 @pytest.mark.services
@@ -117,19 +121,74 @@ def test_what_it_decides_stands_in_a_study_file(bag, tmp_path):
     assert study.training == ["one_0-60"]
     assert study.config.test == ("one_60-100",)
     assert study.config.sub_trajectory == 2.0
-    assert study.config.offline.trials == asked.TRIALS
+    assert study.config.offline.trials == TRIALS
     assert study.config.sequences["one"].points == "/points"
     assert study.config.sequences["one"].reference == "/truth"
 
 
+@pytest.mark.parametrize("n", [1, 3])
+def test_each_recording_is_opened_once(decided, tmp_path, monkeypatch, n):
+    looked, loaded = [], []
+    look, read = BagSource.look_at_clock, loading.read_study
+    monkeypatch.setattr(
+        BagSource, "look_at_clock", lambda *given: looked.append(given[0].name) or look(*given)
+    )
+    monkeypatch.setattr(loading, "read_study", lambda *given: loaded.append(1) or read(*given))
+    for i in range(n):
+        late = [(stamp + i * 10**12, *rest) for stamp, *rest in drives.scans(i)]
+        drives.write_bag(tmp_path / f"bags/{i}.bag", late)
+    failed("bags")
+    assert sorted(looked) == sorted([str(p) for p in tmp_path.glob("bags/*.bag")] * 2)
+    assert len(loaded) == 2  # with the least that it may hold, and as it is written
+    failed("bags")
+    assert (len(looked), len(loaded)) == (2 * n, 3)
+    assert decided[0].config == decided[1].config
+
+
+@pytest.mark.usefixtures("bag")
+def test_a_path_of_an_override_begins_at_the_study(decided, tmp_path):
+    shutil.copy(tmp_path / "one.bag", tmp_path / "other.bag")
+    given = ("one.bag", "--folder", "out", "-o")
+    assert f"{tmp_path}/out/other.bag: there is no such" in failed(
+        *given, "sequences.one.bag=other.bag"
+    )
+    for _ in range(2):
+        assert failed(*given, "sequences.one.bag=../other.bag") == "error: out/out.yaml"
+    assert {s.config.sequences["one"].bag for s in decided} == {str(tmp_path / "other.bag")}
+
+
+@pytest.mark.parametrize("low", [0.0, 50.0])
+def test_a_reference_that_is_surely_noisier_than_an_estimate_is_replaced(
+    bag, decided, monkeypatch, caplog, low
+):
+    error = SimpleNamespace(mean=60.0, low=low, high=70.0)
+    measured = SimpleNamespace(is_noisy=lambda _: True, error=lambda _: error)
+    monkeypatch.setattr("adaptune.reference.check.measure_reference", lambda *_: measured)
+    failed(bag)
+    replaced = low > 0.0
+    words = "one: its reference is wrong by 60 % (50-70) over 2 m, as registrations of scans tell"
+    assert (words in caplog.text) == replaced
+    assert ("To insist: `--reference /truth`" in caplog.text) == replaced
+    kept = decided[0].config.sequences["one"].reference
+    assert kept == study_in("runs/one/one.yaml").config.sequences["one"].reference
+    assert kept == ("estimated" if replaced else "/truth")
+
+
 @pytest.mark.usefixtures("decided")
-def test_what_the_user_changed_stays(bag, tmp_path):
+def test_an_override_of_a_reference_is_insisted_on(bag, monkeypatch):
+    asked_for = []
+    monkeypatch.setattr(studies, "_less_noisy", lambda *given: asked_for.append(given[1]))
+    failed(bag, "-o", "sequences.one.reference=/truth", "--folder", "same")
+    failed(bag, "-o", "sequences.one.reference=estimated", "-o", "sequences.one.stop=1")
+    assert asked_for == ["one"]
+
+
+def test_what_the_user_changed_stays(bag, decided, tmp_path):
     failed(bag)
     path = tmp_path / "runs/one/one.yaml"
     path.write_text(path.read_text() + "lost_track: 2.0\n")
-    assert failed(bag, "--trials", 9, "--minutes", 3).endswith(
-        "one.yaml offline.trials=9 offline.hours=0.05"
-    )
+    failed(bag, "--trials", 9, "--minutes", 3)
+    assert (decided[-1].config.offline.trials, decided[-1].config.offline.hours) == (9, 0.05)
     assert "lost_track: 2.0" in path.read_text()
     said = failed(bag, "--reference", "estimated")
     assert "runs/one/one.yaml: another `adaptune tune` made it: --reference is new;" in said
@@ -205,7 +264,7 @@ def test_several_odometries_share_a_study(bag):
     failed(bag, "--odometry", "gicp,kiss_icp")
     study = study_in("runs/one_gicp+kiss_icp/one_gicp+kiss_icp.yaml")
     assert list(study.config.odometries) == ["gicp", "kiss_icp"]
-    assert study.config.offline.trials == 2 * asked.EACH
+    assert study.config.offline.trials == 2 * EACH
     every = asked.odometries_of("all", imu=False)
     assert {"gicp", "vgicp", "ndt", "kiss_icp"} <= set(every)
     assert "evalio_kiss_icp" not in every

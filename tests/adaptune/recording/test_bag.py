@@ -610,3 +610,17 @@ def test_poses_are_read_once_until_the_file_changes(tmp_path, monkeypatch):
         references = [open_sequence(config).reference() for _ in range(3)]
         assert [len(reference) for reference in references] == [n] * 3
     assert reads.count("/truth") == 2
+
+
+def test_the_same_bags_are_opened_once(tmp_path, monkeypatch):
+    looked, look = [], BagSource.look_at_clock
+    monkeypatch.setattr(
+        BagSource, "look_at_clock", lambda *given: looked.append(given[0].name) or look(*given)
+    )
+    path = tmp_path / "one.bag"
+    config = SequenceConfig(bag=str(path), points="/points", reference="/truth")
+    for n in (40, 50):
+        path.unlink(missing_ok=True)
+        drives.write_bag(path, drives.scans(n_scans=n))
+        assert [open_sequence(config).n_messages for _ in range(3)] == [n] * 3
+    assert looked == [str(path)] * 2
