@@ -24,9 +24,9 @@ from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.progress import Progress, unseen
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
-from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, in_words
+from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import another_odometry
+from adaptune.study.driven import ANY, COST, EQUAL, FILES, another_odometry
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -47,7 +47,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import ANY, COST, EQUAL, FILES, front_rows, in_short, left_out
+from offline.front import front_rows, in_short, left_out
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -434,12 +434,10 @@ def odometry_rows(
     is. Ratios, with 95 % intervals, are to the baseline's error. No rows for a single odometry.
     """
     labels, model, rows = list(study.config.odometries), training.model, list[dict[str, Any]]()
-    for one in labels if len(labels) > 1 else ():
-        mine = [row for row in training.trials if row[ODOMETRY] == one]
-        best = min(mine, key=lambda row: (row["state"] != "complete", row["mean"] or np.inf))
-        for row in mine[:1] + [best] * (best is not mine[0]):
-            which = "its own" if row is mine[0] else f"trial {row['trial']}"
-            about = {"odometry": one, "parameters": which, "training [%]": row["mean"]}
+    for one, (own, best) in trial_rows.of_each(training.trials).items():
+        for row in [own] + [best] * (best is not own):
+            which = "its own parameters" if row is own else f"trial {row['trial']}"
+            about = {"odometry": one, "set": which, "training [%]": row["mean"]}
             rows.append(about | {COST: row[COST], "_trial": row["trial"], "_state": row["state"]})
     if not rows:
         return []

@@ -95,7 +95,7 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
     paths = config.bags()
     within = (config.start, math.inf if config.stop is None else config.stop)
     if not config.cache or not cache.cap():
-        return BagSource(paths, config.points, timing, config.frame, None, within), None
+        return BagSource(paths, config.points, timing, config.frame, None, within, False), None
     try:
         part = (config.start, config.stop, config.stride, config.part)
         read = (config.points, config.frame, timing, *part, config.compensate)

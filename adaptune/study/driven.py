@@ -1,5 +1,6 @@
 """What `adaptune online` drives with a model."""
 
+import logging
 import math
 from collections.abc import Mapping
 from itertools import islice
@@ -17,14 +18,30 @@ from adaptune.odometry.tracker import Tracker
 from adaptune.paired import MIN_RECORDINGS
 from adaptune.space import ODOMETRY, ParameterSet
 from adaptune.study.config import OnlineConfig, SwitchingConfig
-from adaptune.study.study import Mechanism, Study
+from adaptune.study.study import FIXED_SET, MODEL, Mechanism, Study
 
 PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
+OWN, EQUAL, BELOW = "own parameters", "no more CPU time", "just below the budget"
+WITHIN, ANY, UNTRAINED = "within the budget", "any CPU time", "bank without a model"
+FILES = {
+    OWN: "",
+    EQUAL: "equal_cost.yaml",
+    BELOW: "",
+    WITHIN: FIXED_SET,
+    ANY: "any_cost.yaml",
+    ADAPTIVE: MODEL,
+    UNTRAINED: "",
+}
+"""What may be driven, by rising budget, and the files with its parameters.
 
-
+Rows have this order: that of measured costs would be another one each time.
+"""
+COST, ERROR = "cost [ms]", "error [%]"
+"""Columns of CPU time a scan, preparation included, and of the mean error."""
 MOST_SCANS = 600
 """Scans of a recording on which another odometry is tried: seconds."""
+_log = logging.getLogger(__name__)
 
 
 def another_odometry(study: Study, name: str) -> tuple[str, float]:
@@ -34,6 +51,7 @@ def another_odometry(study: Study, name: str) -> tuple[str, float]:
     scans, stamps, T_odom_sensor = study.sequences.open(name), [], []
     if (reference := scans.reference()) is None:
         return other, math.inf
+    _log.info("track is lost on %s: %s is tried there", name, other)
     tracker = Tracker(InProcess(odometry_class(other)()), study.config.health)
     for scan in islice(scans, MOST_SCANS):
         stamps.append(scan.stamp)
