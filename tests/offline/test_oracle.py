@@ -1,5 +1,4 @@
 import shutil
-from dataclasses import replace
 
 import fake_odometry
 import numpy as np
