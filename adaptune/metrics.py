@@ -238,16 +238,15 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
 def lost_in_words(
     best: str,
     errors: Mapping[str, float],
-    odometry: str,
     find_cause: Callable[[str], str],
+    find_other: Callable[[str], tuple[str, float]],
     faults: Iterable[str] = (),
-    find_other: Callable[[str], tuple[str, float]] = lambda _: ("", math.inf),
 ) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
     `errors` has by sequence the mean error of the best, in percent; `find_cause` says what is known
-    of the cause on the worst one; `faults` are what went wrong in the odometry. `find_other` has
-    the name and the error of another odometry there.
+    of the cause on the worst one, and `find_other` has the name and the error of another odometry
+    there; `faults` are what went wrong in the odometry.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
@@ -265,11 +264,12 @@ def lost_in_words(
     if cause := find_cause(worst):
         help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
         return [f"{lost}The likeliest cause: {cause}. {help_}."]
+    known = math.isfinite(error)
+    why = f"{other} loses it, too, so" if known else "the odometry does not suit the recording, or"
     return [
-        f"{lost}The likeliest cause is none of the tuned parameters: the odometry does not suit "
-        f"the recording (compare with `{'kiss_icp' if odometry == 'gicp' else 'gicp'}`), or "
-        f"points' times, motion compensation, the range settings or the reference are wrong "
-        f"(`adaptune inspect --deep` checks the recording)."
+        f"{lost}The likeliest cause is none of the tuned parameters: {why} points' times, motion "
+        f"compensation, the range settings or the reference are wrong (`adaptune inspect --deep` "
+        f"checks the recording)."
     ]
 
 

@@ -137,9 +137,8 @@ def train(
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
         {row["sequence"]: row["fixed, whole"] for row in rows},
-        study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
-        find_other=partial(another_odometry, study),
+        partial(another_odometry, study),
     )
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])

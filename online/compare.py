@@ -361,10 +361,9 @@ def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> l
     said = lost_in_words(
         called(best.mode),
         {row.sequence: row.rte for row in of_best if row.rte is not None},
-        study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
-        [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
         partial(another_odometry, study),
+        [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
     )
     return [*said, "Until then, rely on none."] if said else []
 

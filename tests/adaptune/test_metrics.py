@@ -152,26 +152,27 @@ def test_an_estimate_that_is_not_finite_is_a_failure(bad):
 
 
 def test_a_large_error_has_words():
-    def said(errors, odometry="ndt", **causes):
-        return lost_in_words("the best", errors, odometry, lambda worst: causes.get(worst, ""))
+    def said(errors, other=25.0, fault="", **causes):
+        def find_other(name):
+            return ("gicp", other) if name == "two" else ("gicp", math.inf)
+
+        return lost_in_words("x", errors, lambda name: causes.get(name, ""), find_other, [fault])
 
     assert said({"one": 5.0}) == []
     assert said({"one": math.nan}) == []
-    (words,) = said({"one": 1.0, "two": 10.0})
-    assert words.startswith("Even with the best track is lost on two: RTE 5.5 %. ")
-    assert "compare with `gicp`" in words
-    (words,) = said({"one": 9.0}, "gicp")
-    assert "compare with `kiss_icp`" in words
     # The worst sequence tells.
+    (words,) = said({"one": 1.0, "two": 10.0})
+    assert words.startswith("Even with x track is lost on two: RTE 5.5 %. ")
+    assert "parameters: gicp loses it, too, so points' times" in words
+    (words,) = said({"one": 9.0})
+    assert "the odometry does not suit the recording, or points' times" in words
     (words,) = said({"one": 1.0, "two": 10.0}, two="night")
     assert "The likeliest cause: night." in words
-    held = {"two": ("gicp", 0.619)}
-    (words,) = lost_in_words("x", {"two": 9.0}, "a", lambda _: "night", (), lambda name: held[name])
+    (words,) = said({"two": 9.0}, 0.619, two="night")
     assert "gicp holds track on two, with 0.62 %: it is the odometry, not the data." in words
     assert "night" not in words
-    held["two"] = ("gicp", 25.0)
-    (words,) = lost_in_words("x", {"two": 9.0}, "a", lambda _: "night", (), lambda name: held[name])
-    assert "The likeliest cause: night." in words
+    (words,) = said({"two": 9.0}, 0.619, "it crashed")
+    assert words.endswith("The odometry itself failed there: it crashed. Mend that first.")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.015, 0.05, 0.1])
