@@ -15,10 +15,10 @@ from adaptune.recording.bag import BagSource
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.study import loading
+from adaptune.study.driven import COST
 from adaptune.tuning import EACH, TRIALS, asked, studies, tuned
 from adaptune.yaml12 import Document
 from offline.config import load_study
-from offline.front import COST
 
 FAKE = ("--odometry", "fake_odometry:Fake")
 
