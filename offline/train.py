@@ -15,18 +15,17 @@ from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.machine import available, spare_memory
-from adaptune.metrics import cap, lost_in_words, span
+from adaptune.metrics import cap, span
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.progress import Progress, unseen
-from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import ANY, COST, EQUAL, FILES, another_odometry
+from adaptune.study.driven import ANY, COST, EQUAL, FILES, lost_in_words
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -134,12 +133,8 @@ def train(
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(usable, finished, fixed, whole, errors, config)
     tables.write_rows(study.folder, "training", rows)
-    said = lost_in_words(
-        f"the fixed set, the best of {len(trials)} parameter sets,",
-        {row["sequence"]: row["fixed, whole"] for row in rows},
-        lambda worst: hard_to_track(study.sequences.open(worst)),
-        partial(another_odometry, study),
-    )
+    best = f"the fixed set, the best of {len(trials)} parameter sets,"
+    said = lost_in_words(study, best, {row["sequence"]: row["fixed, whole"] for row in rows})
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     of_bare, worse = bare_in_words(archive, whole, fixed, dropped)

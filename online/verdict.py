@@ -66,11 +66,6 @@ def _adapting(last: Mapping[str, ComparisonRow]) -> list[ComparisonRow]:
     return sorted(found, key=lambda row: [*MODES, row.mode].index(row.mode))
 
 
-def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
-    """The mode that adapts: `adaptive` if it was driven; None if none was."""
-    return next(iter(_adapting(_judged(rows))), None)
-
-
 def called(mode: str) -> str:
     """What a mode is called in a sentence."""
     return CALLED.get(mode, f"`{mode}`")
@@ -269,7 +264,7 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
 
 def _controls(rows: Sequence[ComparisonRow]) -> list[str]:
     """How what adapts compares on the same frames with what chooses nothing."""
-    main = adapting(rows)
+    main = next(iter(_adapting(_judged(rows))), None)
     if main is None or EVEN not in main.against:
         return []
     ratio, cost = main.against[EVEN], {row.mode: row.cpu_ms for row in last_rows(rows)}[EVEN]

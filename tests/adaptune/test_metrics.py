@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from adaptune.metrics import (
     absolute_error,
     kitti_error,
-    lost_in_words,
     relative_error,
     sub_trajectory_rte,
     travelled,
@@ -149,30 +148,6 @@ def test_an_estimate_that_is_not_finite_is_a_failure(bad):
     errors = sub_trajectory_rte(T_ref, T_est, 1.5)
     assert np.isinf(errors[[2, 4]]).all()
     assert np.isnan(errors).tolist() == [False] * 7 + [True] * 2
-
-
-def test_a_large_error_has_words():
-    def said(errors, other=25.0, fault="", **causes):
-        def find_other(name):
-            return ("gicp", other) if name == "two" else ("gicp", math.inf)
-
-        return lost_in_words("x", errors, lambda name: causes.get(name, ""), find_other, [fault])
-
-    assert said({"one": 5.0}) == []
-    assert said({"one": math.nan}) == []
-    # The worst sequence tells.
-    (words,) = said({"one": 1.0, "two": 10.0})
-    assert words.startswith("Even with x track is lost on two: RTE 5.5 %. ")
-    assert "parameters: gicp loses it, too, so points' times" in words
-    (words,) = said({"one": 9.0})
-    assert "the odometry does not suit the recording, or points' times" in words
-    (words,) = said({"one": 1.0, "two": 10.0}, two="night")
-    assert "The likeliest cause: night." in words
-    (words,) = said({"two": 9.0}, 0.619, two="night")
-    assert "gicp holds track on two, with 0.62 %: it is the odometry, not the data." in words
-    assert "night" not in words
-    (words,) = said({"two": 9.0}, 0.619, "it crashed")
-    assert words.endswith("The odometry itself failed there: it crashed. Mend that first.")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.015, 0.05, 0.1])
