@@ -81,6 +81,8 @@ def _typestore() -> Any:
 
 
 _NOTHING = Chunk(0, 0, bytes)
+_UNPACKED = 3.0
+"""Times the size of a bag that BZ2 packs, its size without."""
 
 
 class KeptReader(Reader):
@@ -89,15 +91,16 @@ class KeptReader(Reader):
     def __init__(self, path: Path, keep: bool = True):
         super().__init__(path)
         self._folder = cache.folder() / cache.key([path], "unpacked")
-        self._keep = keep and cache.cap() > 0
+        self._room = round(_UNPACKED * path.stat().st_size)
+        self._keep = keep and self._room < cache.cap()
 
     def read_chunk(self) -> Chunk:
         """Where a chunk is, and what unpacks it."""
         chunk = super().read_chunk()
         if not self._keep or chunk.decompressor is not decompressors["bz2"]:
             return chunk
-        path = self._folder / str(chunk.datapos)
-        return chunk._replace(decompressor=partial(cache.unpacked, path, chunk.decompressor))
+        given = self._folder / str(chunk.datapos), self._room, chunk.decompressor
+        return chunk._replace(decompressor=partial(cache.unpacked, *given))
 
 
 class IndexReader(KeptReader):

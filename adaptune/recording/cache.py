@@ -213,16 +213,19 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
             _log.warning(_NOT_KEPT, about.get("name"), error)
 
 
-def unpacked(path: Path, unpack: Callable[[bytes], bytes], packed: bytes) -> bytes:
-    """Unpack bytes, unless a file of an entry has them from before."""
+def unpacked(path: Path, room: int, unpack: Callable[[bytes], bytes], packed: bytes) -> bytes:
+    """Unpack bytes, unless a file has them from before, in an entry that needs so much room."""
     about = path.with_name(_ABOUT)
     with suppress(OSError):
         found = path.read_bytes()
         about.touch()
         return found
     found = unpack(packed)
-    with suppress(OSError, MachineError), replacing(path) as temporary:
-        temporary.write_bytes(found)
+    with suppress(OSError, MachineError):
+        if not about.exists():
+            make_room(room)
+        with replacing(path) as temporary:
+            temporary.write_bytes(found)
         about.touch()
     return found
 

@@ -1,6 +1,7 @@
 import errno
 import re
 import resource
+import shutil
 import sqlite3
 from contextlib import closing
 
@@ -17,7 +18,7 @@ from small_bag import START, cloud, pose, texts
 from adaptune.errors import AdaptuneError, MachineError
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.bag import BagSource, IndexReader
-from adaptune.recording.cache import make_room
+from adaptune.recording.cache import cap, make_room
 from adaptune.recording.clouds import CLOUDS, LIVOX_TYPES
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
@@ -519,15 +520,21 @@ def test_what_bz2_packs_is_unpacked_once(tmp_path, monkeypatch):
     assert same(list(other), first[:10])
     assert other.reference() is not None
     assert len(packed) == n
-    # The least recently used entries make room for others.
-    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "1e-6")
-    make_room()
-    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "1")
+    # What is unpacked is removed as other entries are.
+    (entry,) = {file.parent for file in (tmp_path / "cache").glob("*/*") if file.stem.isdigit()}
+    shutil.rmtree(entry)
     list(opened(path, cache=True, stop=2.0))  # reads no chunk after that
     assert n < (again := len(packed)) < 2 * n
-    # And who wants no cache has none.
+    make_room(cap())
+    assert not entry.exists()
+    # A bag that may not fit is not kept, nor what a study wants to have no cache.
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", str(2e-9 * path.stat().st_size))
+    list(opened(path, cache=True))
+    assert not entry.exists()
+    monkeypatch.delenv("ADAPTUNE_CACHE_GB")
     list(opened(path))
-    assert len(packed) >= again + n
+    assert not entry.exists()
+    assert len(packed) >= again + 2 * n
 
 
 def test_only_chunks_of_the_time_are_looked_up(tmp_path):
