@@ -90,7 +90,7 @@ def choices(
         modes += [FIXED] * (may.WITHIN in row["what"])
         told |= {*modes}
         found.append(dict(row) | {"what": row["what"].split(", ")[0], "mode": "", _ON: "training"})
-        found[-1] |= {"in training": (row[_ERROR], row[_COST])}
+        found[-1] |= {"in training": (row[ERROR], row[COST])}
         found[-1] |= next((_driven(last[mode]) for mode in modes if mode in last), {})
         found[-1]["recommended"] = best in modes
     for mode, what in _ALONE.items():

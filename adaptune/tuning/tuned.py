@@ -21,6 +21,7 @@ from adaptune.tuning.asked import Asked, check_guarded, named_odometry
 from adaptune.tuning.page import write_study_page
 from adaptune.tuning.studies import written
 from adaptune.tuning.verdict import write_verdict
+from offline.campaign import FITTING
 from offline.config import OfflineStudy
 from offline.scenario import scenario
 from offline.search import ELAPSED, Stopwatch
