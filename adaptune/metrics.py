@@ -1,7 +1,7 @@
 """Errors of an odometry: over sub-trajectories, as KITTI's benchmark and as evo define them."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -233,44 +233,6 @@ LOST_ABOVE = 5.0  # percent; an odometry with a larger mean error does not track
 def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
     """Bound errors in percent by `FAILURE`, so that one lost track does not hide all others."""
     return np.minimum(errors.astype(np.float64), FAILURE)
-
-
-def lost_in_words(
-    best: str,
-    errors: Mapping[str, float],
-    odometry: str,
-    find_cause: Callable[[str], str],
-    faults: Iterable[str] = (),
-    find_other: Callable[[str], tuple[str, float]] = lambda _: ("", math.inf),
-) -> list[str]:
-    """A sentence where even the best does not track: the likeliest cause, and what to try.
-
-    `errors` has by sequence the mean error of the best, in percent; `find_cause` says what is known
-    of the cause on the worst one; `faults` are what went wrong in the odometry. `find_other` has
-    the name and the error of another odometry there.
-    """
-    if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
-        return []
-    where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
-    lost = f"Even with {best} track is lost on {where}: RTE {mean:.1f} %. "
-    if fault := next(filter(None, faults), ""):
-        return [f"{lost}The odometry itself failed there: {fault}. Mend that first."]
-    worst = max(errors, key=lambda name: errors[name])
-    other, error = find_other(worst)
-    if error <= LOST_ABOVE:
-        return [
-            f"{lost}{other} holds track on {worst}, with {error:.2f} %: it is the odometry, not "
-            f"the data. Drive {other}, or widen the ranges of the parameters."
-        ]
-    if cause := find_cause(worst):
-        help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
-        return [f"{lost}The likeliest cause: {cause}. {help_}."]
-    return [
-        f"{lost}The likeliest cause is none of the tuned parameters: the odometry does not suit "
-        f"the recording (compare with `{'kiss_icp' if odometry == 'gicp' else 'gicp'}`), or "
-        f"points' times, motion compensation, the range settings or the reference are wrong "
-        f"(`adaptune inspect --deep` checks the recording)."
-    ]
 
 
 def worst_tenth(logs: NDArray[np.float64]) -> float:

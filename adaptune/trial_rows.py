@@ -117,17 +117,26 @@ def _short(row: Row) -> Row:
     return short | {key: row[key] for key in keys[last:]}
 
 
+def of_each(table: Sequence[Row]) -> dict[str, tuple[Row, Row]]:
+    """Of several odometries, the rows of each one's own parameters and of its best set, or none."""
+    found: dict[str, tuple[Row, Row]] = {}
+    for row in table:
+        # The first trial of each has its own parameters.
+        own, best = found.get(label := row.get(ODOMETRY, ""), (row, row))
+        found[label] = own, min(best, row, key=_rank)
+    return found if len(found) > 1 else {}
+
+
+def _rank(row: Row) -> tuple[bool, float]:
+    return row.get("state", "complete") != "complete", row["mean"] or np.inf
+
+
 def by_odometry(table: Sequence[Row]) -> Listing | None:
     """Of several odometries, what each has with its own parameters and tuned, the best first."""
-    rows = []
-    for label in dict.fromkeys(row.get(ODOMETRY) for row in table):
-        mine = [row for row in table if row.get(ODOMETRY) == label]
-        known = [row for row in mine if row["mean"] is not None]
-        best = min(known, key=lambda row: row["mean"], default={})
-        # The first trial of each has its own parameters.
-        one = {"odometry": label, "its own parameters [%]": mine[0]["mean"]}
-        one |= {"tuned [%]": best.get("mean"), "trial": best.get("trial")}
-        rows.append(one | {"cost [ms]": best.get("cost")})
-    rows.sort(key=lambda row: np.inf if row["tuned [%]"] is None else row["tuned [%]"])
+    rows = [
+        {"odometry": label, "its own parameters [%]": own["mean"], "tuned [%]": best["mean"]}
+        | {key: best[column] for key, column in (("trial", "trial"), ("cost [ms]", "cost"))}
+        for label, (own, best) in sorted(of_each(table).items(), key=lambda one: _rank(one[1][1]))
+    ]
     title = "RTE of each odometry in training, over parts of the recordings"
-    return Listing(title, rows) if len(rows) > 1 else None
+    return Listing(title, rows) if rows else None

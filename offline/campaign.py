@@ -264,13 +264,14 @@ class Forecast(NamedTuple):
     """Seconds, where all workers are at work."""
 
     each: float  # to try a set on all training sequences
-    rest: float  # of what follows: finalists' drives of whole recordings, and the replays
+    rest: float  # of the drives that follow: finalists' of whole recordings, and the replays
 
     def words(self, left: float, most: float) -> str:
         """How long it takes to try so many sets and to finish, in at most so many seconds."""
-        n, whole = left, self.each * left + self.rest
+        rest = self.rest + FITTING
+        n, whole = left, self.each * left + rest
         if whole > most:
-            n, whole = max(0.0, (most - self.rest) // max(self.each, 1e-9)), most
+            n, whole = max(0.0, (most - rest) // max(self.each, 1e-9)), most
         return f"it takes {about(whole)}: {n:.0f} parameter sets of {self.each:.1f} s, and the rest"
 
 
@@ -292,13 +293,13 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
             n_sets = len(baselines) + FINALISTS + 2 * OTHERS
             rest += COST * costs[-1] * len(frames.stamps) * n_sets
     workers = max(workers, 1)  # those of a cluster may come later
-    rest = FITTING + rest / workers
+    rest /= workers
     if clock.replays:
         members = study.config.online.switching.size if study.mechanism == "bank" else 0
         scans = sum(study.sequences.open(name).n_messages for name in study.config.test)
         replay = float(np.mean(costs)) * scans
         rest += replay * ALONE
-        free = LEFT_BY_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest
+        free = LEFT_BY_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest - FITTING
         # A bank that takes longer is not replayed.
         rest += min(replay * len(study.rules) * (members + 1), max(free, 0.0))
     return Forecast(each / workers, rest)
@@ -388,7 +389,9 @@ class Campaign:
         spent = self._expected.each + 3600.0 * (now - self._begun)
         each = spent / (1.0 + (driven - self._resumed) / n)
         left = (self._schedule.total - driven) / n + 1.0
-        return now + (each * left + self._expected.rest) / 3600.0
+        # What slows sets down slows down all that follows them.
+        left += self._expected.rest / max(self._expected.each, 1e-3)
+        return now + (each * left + FITTING) / 3600.0
 
     def _show(self, what: str, done: float, of: int, remark: str = "", /) -> None:
         search = self._search

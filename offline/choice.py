@@ -191,7 +191,7 @@ def why_not(blocks: BlockErrors, trial: int, fixed: int) -> str:
         if errors is not None and surely_worse(blocks._replace(errors=errors))[k]:
             return f"it is surely worse than the odometry's own parameters{what} on a recording"
     bound = bounds(blocks)
-    mine, other = (f"{bound[list(blocks.trials).index(one)]:.2f}" for one in (trial, fixed))
+    mine, other = (f"{bound[list(blocks.trials).index(one)]:.3f}" for one in (trial, fixed))
     return f"its error is less sure (by its bound {mine} times the baseline's, against {other})"
 
 

@@ -11,11 +11,12 @@ import numpy as np
 from adaptune.errors import AdaptuneError
 from adaptune.machine import resident_megabytes
 from adaptune.model import ErrorModel
+from adaptune.model.registry import ADAPTIVE
 from adaptune.odometry.tracker import Tracker
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
 from adaptune.space import ODOMETRY, in_words
-from adaptune.study.study import FIXED_SET, MODEL
+from adaptune.study.driven import ANY, BELOW, COST, EQUAL, ERROR, FILES, OWN, WITHIN
 from offline.choice import (
     LEAST_COST,
     MOST_OF_PERIOD,
@@ -30,17 +31,9 @@ from offline.choice import (
 from offline.config import OfflineStudy
 from offline.labelled import LabelledData
 
-COST = "cost [ms]"
-"""Column of CPU time a scan, preparation included."""
-OWN, FIXED, EQUAL = "own parameters", "within the budget", "no more CPU time"
-"""What rows of the front are; one set may be several of them, in this order."""
-BELOW, ANY, BANK = "just below the budget", "any CPU time", "adaptive"
-FILES = {FIXED: FIXED_SET, EQUAL: "equal_cost.yaml", ANY: "any_cost.yaml", BANK: MODEL}
-"""Where the parameters of such rows are."""
-
 
 def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> list[dict[str, Any]]:
-    """Error over cost, by rising cost: the baseline, the best sets at several costs, and the bank.
+    """Error over cost: the baseline, the best sets within rising budgets, and the bank.
 
     Errors are those of drives of whole recordings in training. Ratios to the baseline's are those
     to expect on another drive, with intervals of 95 %. The sentence on what was `left_out` stands
@@ -51,14 +44,14 @@ def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> lis
     of_bounds = dict(zip(blocks.trials, bounds(blocks).tolist(), strict=True))
     costs = data.beside or data.costs
     roles: dict[int, list[str]] = {}
-    for what, trial in zip((OWN, FIXED, EQUAL, ANY, BELOW), front, strict=True):
+    for what, trial in zip((OWN, WITHIN, EQUAL, ANY, BELOW), front, strict=True):
         if what != BELOW or trial not in roles:
             roles.setdefault(trial, []).append(what)
     rows = []
     for trial, names in roles.items():
         error, ratio = means[list(blocks.trials).index(trial)], elsewhere(blocks, trial)
         row = _row(names, error, costs.alone(trial), ratio) | {
-            "recommended": trial == model.fixed and model.recommended != BANK,
+            "recommended": trial == model.fixed and model.recommended != ADAPTIVE,
             "parameters": in_words(data.sets[trial]),
             "odometry": data.sets[trial].get(ODOMETRY, ""),
         }
@@ -70,12 +63,13 @@ def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> lis
         wider = np.log(np.array([of_bank["low"], of_bank["high"]]) / by)
         ends = np.hypot(np.log(np.array(fixed[1:]) / fixed.ratio), wider) * (-1.0, 1.0)
         ratio = Elsewhere(by * fixed.ratio, *(by * fixed.ratio * np.exp(ends)).tolist())
-        row = _row([BANK], error, costs.adaptive(members), ratio)
-        row |= {"recommended": model.recommended == BANK}
+        row = _row([ADAPTIVE], error, costs.adaptive(members), ratio)
+        row |= {"recommended": model.recommended == ADAPTIVE}
         row |= {"parameters": f"trials {', '.join(map(str, members))}", "odometry": ""}
         rows.append(row | {"trial": None, "_bound": None})
     rows = [row | {"left out": left_out if row["recommended"] else ""} for row in rows]
-    return sorted(rows, key=lambda row: row[COST])
+    order = list(FILES)
+    return sorted(rows, key=lambda row: min(map(order.index, row["what"].split(", "))))
 
 
 def in_short(data: LabelledData) -> str:
@@ -93,9 +87,9 @@ def in_short(data: LabelledData) -> str:
 
 
 def _row(roles: Sequence[str], error: float, cost: float, ratio: Elsewhere) -> dict[str, Any]:
-    row = {"what": ", ".join(roles), "error [%]": float(error), COST: cost}
+    row = {"what": ", ".join(roles), ERROR: float(error), COST: cost}
     row |= {"vs baseline": ratio.ratio, "low": ratio.low, "high": ratio.high}
-    return row | {"file": next((FILES[role] for role in roles if role in FILES), "")}
+    return row | {"file": next(filter(None, map(FILES.get, roles)), "")}
 
 
 AS_GOOD, CHEAPER = 1.01, 0.9
@@ -117,7 +111,7 @@ def left_out(
             return ""
         means, _ = mean_and_error(blocks.errors, blocks.sequence)
         least, own = means[list(blocks.trials).index(model.fixed)], costs.alone(model.fixed)
-        if model.recommended == BANK:
+        if model.recommended == ADAPTIVE:
             least *= model.expected["geometric"]
             own = costs.adaptive(t for t in model.bank if t not in model.reserve)
         errors, each = means / max(least, 1e-9), [costs.alone(t) for t in blocks.trials]

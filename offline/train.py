@@ -15,18 +15,17 @@ from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.machine import available, spare_memory
-from adaptune.metrics import cap, lost_in_words, span
+from adaptune.metrics import cap, span
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.progress import Progress, unseen
-from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
-from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, in_words
+from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import another_odometry
+from adaptune.study.driven import ANY, COST, EQUAL, FILES, lost_in_words
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -47,7 +46,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import ANY, COST, EQUAL, FILES, front_rows, in_short, left_out
+from offline.front import front_rows, in_short, left_out
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -134,13 +133,8 @@ def train(
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(usable, finished, fixed, whole, errors, config)
     tables.write_rows(study.folder, "training", rows)
-    said = lost_in_words(
-        f"the fixed set, the best of {len(trials)} parameter sets,",
-        {row["sequence"]: row["fixed, whole"] for row in rows},
-        study.odometry.name,
-        lambda worst: hard_to_track(study.sequences.open(worst)),
-        find_other=partial(another_odometry, study),
-    )
+    best = f"the fixed set, the best of {len(trials)} parameter sets,"
+    said = lost_in_words(study, best, {row["sequence"]: row["fixed, whole"] for row in rows})
     said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     of_bare, worse = bare_in_words(archive, whole, fixed, dropped)
@@ -434,12 +428,10 @@ def odometry_rows(
     is. Ratios, with 95 % intervals, are to the baseline's error. No rows for a single odometry.
     """
     labels, model, rows = list(study.config.odometries), training.model, list[dict[str, Any]]()
-    for one in labels if len(labels) > 1 else ():
-        mine = [row for row in training.trials if row[ODOMETRY] == one]
-        best = min(mine, key=lambda row: (row["state"] != "complete", row["mean"] or np.inf))
-        for row in mine[:1] + [best] * (best is not mine[0]):
-            which = "its own" if row is mine[0] else f"trial {row['trial']}"
-            about = {"odometry": one, "parameters": which, "training [%]": row["mean"]}
+    for one, (own, best) in trial_rows.of_each(training.trials).items():
+        for row in [own] + [best] * (best is not own):
+            which = "its own parameters" if row is own else f"trial {row['trial']}"
+            about = {"odometry": one, "set": which, "training [%]": row["mean"]}
             rows.append(about | {COST: row[COST], "_trial": row["trial"], "_state": row["state"]})
     if not rows:
         return []

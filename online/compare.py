@@ -3,7 +3,6 @@
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import manifest
-from adaptune.metrics import LOST_ABOVE, lost_in_words, worst_tenth
+from adaptune.metrics import LOST_ABOVE, worst_tenth
 from adaptune.model import ErrorModel, rules
 from adaptune.model.registry import ADAPTIVE
 from adaptune.paired import Ratio, ratio
-from adaptune.reference.check import hard_to_track
 from adaptune.reference.judge import StandardErrors
 from adaptune.report import tables as report
 from adaptune.space import ODOMETRY
 from adaptune.study.config import ALSO
-from adaptune.study.driven import PER_STRETCH, another_odometry
+from adaptune.study.driven import PER_STRETCH, lost_in_words
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
@@ -358,14 +356,9 @@ def _of_one_set(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
 def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> list[str]:
     """Where what is advised has lost its way, and the likeliest cause."""
     of_best = [row for row in rows if row.mode == best.mode and row.sequence != ALL]
-    said = lost_in_words(
-        called(best.mode),
-        {row.sequence: row.rte for row in of_best if row.rte is not None},
-        study.odometry.name,
-        lambda worst: hard_to_track(study.sequences.open(worst)),
-        [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
-        partial(another_odometry, study),
-    )
+    errors = {row.sequence: row.rte for row in of_best if row.rte is not None}
+    faults = [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE]
+    said = lost_in_words(study, called(best.mode), errors, faults)
     return [*said, "Until then, rely on none."] if said else []
 
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from adaptune.model.registry import ADAPTIVE
 from adaptune.paired import Ratio
-from adaptune.study.study import FIXED_SET, MODEL
+from adaptune.study import driven as may
+from adaptune.study.driven import COST, ERROR, FILES
 from online.modes import BASELINE, EVEN, FIXED, MODES, UNTRAINED
 from online.statistics import ALL, ORACLE, ComparisonRow
 from online.tables import YARDSTICKS, last_rows
@@ -65,11 +66,6 @@ def _adapting(last: Mapping[str, ComparisonRow]) -> list[ComparisonRow]:
     return sorted(found, key=lambda row: [*MODES, row.mode].index(row.mode))
 
 
-def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
-    """The mode that adapts: `adaptive` if it was driven; None if none was."""
-    return next(iter(_adapting(_judged(rows))), None)
-
-
 def called(mode: str) -> str:
     """What a mode is called in a sentence."""
     return CALLED.get(mode, f"`{mode}`")
@@ -81,43 +77,43 @@ def choices(
     best: str = "",
     obstacle: str = "",
 ) -> list[dict[str, Any]]:
-    """What may be driven, by rising cost: the best of each budget, and the bank.
+    """What may be driven: the best within each budget, and the bank.
 
     Error and cost are those of the test, or of training where it was not driven on the test.
     `front` has the rows of training, see `offline.front.front_rows`; `best` is the mode to drive.
     """
     last, found, told = _judged(rows), list[dict[str, Any]](), set[str]()
     for row in front:
-        if row["what"] == "just below the budget" or (row["trial"] is None and obstacle):
+        if row["what"] == may.BELOW or (row["trial"] is None and obstacle):
             continue
         modes = [ADAPTIVE] * (row["trial"] is None) + [BASELINE] * (row["trial"] == 0)
-        modes += [FIXED] * ("within the budget" in row["what"])
+        modes += [FIXED] * (may.WITHIN in row["what"])
         told |= {*modes}
         found.append(dict(row) | {"what": row["what"].split(", ")[0], "mode": "", _ON: "training"})
-        found[-1] |= {"in training": (row[_ERROR], row[_COST])}
+        found[-1] |= {"in training": (row[ERROR], row[COST])}
         found[-1] |= next((_driven(last[mode]) for mode in modes if mode in last), {})
         found[-1]["recommended"] = best in modes
-    for mode, (what, file) in _ALONE.items():
+    for mode, what in _ALONE.items():
         # Of several odometries, the first one's own parameters may be no row of the front.
         if mode in last and mode not in told and (mode in (best, ADAPTIVE) or not front):
-            one = {"what": what, "file": file, "recommended": mode == best, **_driven(last[mode])}
+            one = {
+                "what": what,
+                "file": FILES[what],
+                "recommended": mode == best,
+                **_driven(last[mode]),
+            }
             one |= dict.fromkeys(("trial", "low", "high"))
             found.append(one | dict.fromkeys(("odometry", "parameters", "left out"), ""))
-    return sorted(found, key=lambda row: math.inf if row[_COST] is None else row[_COST])
+    return sorted(found, key=lambda row: list(FILES).index(row["what"]))
 
 
-_ON, _ERROR, _COST = "driven on", "error [%]", "cost [ms]"
-_ALONE = {
-    BASELINE: ("own parameters", ""),
-    FIXED: ("within the budget", FIXED_SET),
-    ADAPTIVE: (ADAPTIVE, MODEL),
-    UNTRAINED: ("bank without a model", ""),
-}
-"""What modes are that training does not know, and their files."""
+_ON = "driven on"
+_ALONE = {BASELINE: may.OWN, FIXED: may.WITHIN, ADAPTIVE: ADAPTIVE, UNTRAINED: may.UNTRAINED}
+"""What modes are that training does not know."""
 
 
 def _driven(row: ComparisonRow) -> dict[str, Any]:
-    return {"mode": row.mode, _ON: "test", _ERROR: row.rte, _COST: row.cpu_ms}
+    return {"mode": row.mode, _ON: "test", ERROR: row.rte, COST: row.cpu_ms}
 
 
 def verdict(
@@ -268,7 +264,7 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
 
 def _controls(rows: Sequence[ComparisonRow]) -> list[str]:
     """How what adapts compares on the same frames with what chooses nothing."""
-    main = adapting(rows)
+    main = next(iter(_adapting(_judged(rows))), None)
     if main is None or EVEN not in main.against:
         return []
     ratio, cost = main.against[EVEN], {row.mode: row.cpu_ms for row in last_rows(rows)}[EVEN]

@@ -349,7 +349,7 @@ def _say_recordings(tuned: "Tuned") -> None:
 def say_odometries(tuned: "Tuned") -> None:
     """Of several odometries, which does best on the test, and what each has there, and tuned."""
     from adaptune.report.tables import cell_text
-    from offline.front import COST
+    from adaptune.study.driven import COST
 
     if not (rows := tuned.of_each):
         return
@@ -358,9 +358,7 @@ def say_odometries(tuned: "Tuned") -> None:
         cost = f"{cell_text(best['test [%]'])} % at {cell_text(best[COST])} ms a scan"
         dear = allowed is not None and best["_trial"] not in allowed
         more = " It costs more than the budget." * dear
-        of = f"{best['odometry']} with {best['parameters']}".replace(
-            "its own", "its own parameters"
-        )
+        of = f"{best['odometry']} with {best['set']}"
         say(f"Best odometry on the test: {of}, {cost}.{more}")
     for row in rows:
         if row["_state"] != "complete":

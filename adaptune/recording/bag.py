@@ -8,7 +8,8 @@ import resource
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache as once
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,8 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune.errors import Finding, blame_machine, nearest
-from adaptune.recording import clouds
+from adaptune.errors import AdaptuneError, Finding, blame_machine, nearest
+from adaptune.recording import cache, clouds
 from adaptune.recording.cache import status_key
 from adaptune.recording.clouds import CLOUDS, PointCloudError, header_of
 from adaptune.recording.config import files_of
@@ -70,7 +71,7 @@ def storages(reader: AnyReader) -> list[Any]:
     return [file for one in readers for file in getattr(one, "storages", [one])]
 
 
-@cache
+@once
 def _typestore() -> Any:
     """Message definitions for ROS 2 bags that contain none."""
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -80,9 +81,29 @@ def _typestore() -> Any:
 
 
 _NOTHING = Chunk(0, 0, bytes)
+_UNPACKED = 3.0
+"""Times the size of a bag that BZ2 packs, its size without."""
 
 
-class IndexReader(Reader):
+class KeptReader(Reader):
+    """Reads ROS 1 bags, and keeps in the cache what BZ2 had packed: to unpack that takes long."""
+
+    def __init__(self, path: Path, keep: bool = True):
+        super().__init__(path)
+        self._folder = cache.folder() / cache.key([path], "unpacked")
+        self._room = round(_UNPACKED * path.stat().st_size)
+        self._keep = keep and self._room < cache.cap()
+
+    def read_chunk(self) -> Chunk:
+        """Where a chunk is, and what unpacks it."""
+        chunk = super().read_chunk()
+        if not self._keep or chunk.decompressor is not decompressors["bz2"]:
+            return chunk
+        given = self._folder / str(chunk.datapos), self._room, chunk.decompressor
+        return chunk._replace(decompressor=partial(cache.unpacked, *given))
+
+
+class IndexReader(KeptReader):
     """Reads ROS 1 bags that are opened by the index at their end alone.
 
     rosbags visits every chunk when it opens a bag, which takes seconds for 100,000 of them.
@@ -110,7 +131,7 @@ class IndexReader(Reader):
             return False
         assert self.bio is not None
         self.bio.seek(self.chunk_infos[0].pos)
-        return super().read_chunk().decompressor is decompressors["bz2"]
+        return Reader.read_chunk(self).decompressor is decompressors["bz2"]
 
     def messages(
         self,
@@ -148,7 +169,8 @@ class BagSource:
 
     `paths` are as `bag_paths` gives them. The topic of the point clouds may be left out where there
     is only one, and their frame where the topic has only one. Given the result of `about`, or where
-    the same bags were opened before, they are not opened now.
+    the same bags were opened before, they are not opened now. What BZ2 packs is unpacked once if
+    `keep`, and kept in the cache.
     """
 
     pose_files: Sequence[Path] = ()
@@ -161,8 +183,10 @@ class BagSource:
         frame: str | None = None,
         about: Mapping[str, Any] | None = None,
         within: tuple[float, float] = (0.0, math.inf),
+        keep: bool = True,
     ):
         self.paths, self.timing, self.frame = tuple(paths), timing, frame
+        self._keep = keep
         key = (*map(status_key, self.files), points, within)
         about = _shown.get(key) if about is None else about
         given = UNOPENED if about is None else about
@@ -450,11 +474,14 @@ class BagSource:
                     )
         try:
             reader = AnyReader(self.paths, default_typestore=_typestore())
-            if by_index and not reader.is2:
-                reader.readers = [IndexReader(path) for path in self.paths]
+            if not reader.is2:
+                kind = IndexReader if by_index else KeptReader
+                reader.readers = [kind(path, self._keep) for path in self.paths]
             reader.open()
             if not all(isinstance(c.msgcount, int) for c in reader.connections):
                 raise TypeError("metadata.yaml counts in no numbers")  # noqa: TRY301
+        except AdaptuneError:  # of the cache
+            raise
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
             # SQLite does not say why it cannot open a file.

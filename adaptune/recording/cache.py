@@ -14,7 +14,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import platformdirs
 
-from adaptune.errors import AdaptuneError
-from adaptune.files import DAMAGED_NPZ, expand_user
+from adaptune.errors import AdaptuneError, MachineError
+from adaptune.files import DAMAGED_NPZ, expand_user, replacing
 from adaptune.recording.scan import Scan
 
 _log = logging.getLogger(__name__)
@@ -211,6 +211,23 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
                 writer.keep(key, about)
         except OSError as error:
             _log.warning(_NOT_KEPT, about.get("name"), error)
+
+
+def unpacked(path: Path, room: int, unpack: Callable[[bytes], bytes], packed: bytes) -> bytes:
+    """Unpack bytes, unless a file has them from before, in an entry that needs so much room."""
+    about = path.with_name(_ABOUT)
+    with suppress(OSError):
+        found = path.read_bytes()
+        about.touch()
+        return found
+    found = unpack(packed)
+    with suppress(OSError, MachineError):
+        if not about.exists():
+            make_room(room)
+        with replacing(path) as temporary:
+            temporary.write_bytes(found)
+        about.touch()
+    return found
 
 
 def make_room(size: int = 0) -> None:

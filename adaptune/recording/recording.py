@@ -94,17 +94,16 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
         return scan_folder(Path(config.folder), timing), None
     paths = config.bags()
     within = (config.start, math.inf if config.stop is None else config.stop)
-    if not config.cache or not cache.cap():
-        return BagSource(paths, config.points, timing, config.frame, None, within), None
+    key, entry, keep = None, None, config.cache and cache.cap() > 0
     try:
         part = (config.start, config.stop, config.stride, config.part)
         read = (config.points, config.frame, timing, *part, config.compensate)
-        key = cache.key(files_of(paths), read)
+        if keep:
+            entry = cache.find(key := cache.key(files_of(paths), read))
     except OSError as error:
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
-    entry = cache.find(key)
     about = None if entry is None else entry.about
-    return BagSource(paths, config.points, timing, config.frame, about, within), key
+    return BagSource(paths, config.points, timing, config.frame, about, within, keep), key
 
 
 def _check_topics(source: "Source", config: SequenceConfig) -> None:

@@ -115,17 +115,12 @@ def chart_rows(chart: Chart) -> list[dict[str, Any]]:
     rows = []
     for number, panel in enumerate(chart.panels, start=1):
         for item in panel.drawn:
-            if isinstance(item, Spans):
-                columns: dict[str, Any] = {"text": item.names, "x": item.edges[:-1]}
-            elif isinstance(item, Band):
-                columns = {"x": item.x, "low": item.low, "high": item.high}
-            elif isinstance(item, Words):
+            if isinstance(item, Words):
                 continue  # they name what is drawn
-            else:
-                columns = {"x": item.x, "y": item.y}
-                for key in ("colour", "texts"):
-                    if (values := getattr(item, key, None)) is not None:
-                        columns[key.removesuffix("s")] = values
+            columns = {column: getattr(item, key, None) for key, column in _PARTS.items()}
+            if isinstance(item, Spans):
+                columns |= {"text": item.names, "x": item.edges[:-1]}
+            columns = {column: of for column, of in columns.items() if of is not None}
             about = {"panel": panel.title or number, "name": item.name}
             about |= {"x axis": panel.x.label, "y axis": panel.y.label}
             for values in zip(*columns.values(), strict=True):
@@ -134,7 +129,8 @@ def chart_rows(chart: Chart) -> list[dict[str, Any]]:
     return rows
 
 
-_COLUMNS = ("panel", "name", "x", "y", "low", "high", "colour", "text", "x axis", "y axis")
+_PARTS = {key: key.removesuffix("s") for key in ("x", "y", "low", "high", "colour", "texts")}
+_COLUMNS = ("panel", "name", *_PARTS.values(), "x axis", "y axis")
 """Of `chart_rows`."""
 Charts = Iterator[Chart | str | None]
 """Charts of a part of a study; of what is missing, a sentence that says what to run, or None."""

@@ -1,13 +1,14 @@
 """What `adaptune online` drives with a model."""
 
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import islice
 
 import numpy as np
 
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import cap, sub_trajectory_rte
+from adaptune.metrics import LOST_ABOVE, cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE, STANDBY
 from adaptune.odometry.base import InProcess
@@ -15,16 +16,33 @@ from adaptune.odometry.factory import Factory
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.tracker import Tracker
 from adaptune.paired import MIN_RECORDINGS
+from adaptune.reference.check import hard_to_track
 from adaptune.space import ODOMETRY, ParameterSet
 from adaptune.study.config import OnlineConfig, SwitchingConfig
-from adaptune.study.study import Mechanism, Study
+from adaptune.study.study import FIXED_SET, MODEL, Mechanism, Study
 
 PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
+OWN, EQUAL, BELOW = "own parameters", "no more CPU time", "just below the budget"
+WITHIN, ANY, UNTRAINED = "within the budget", "any CPU time", "bank without a model"
+FILES = {
+    OWN: "",
+    EQUAL: "equal_cost.yaml",
+    BELOW: "",
+    WITHIN: FIXED_SET,
+    ANY: "any_cost.yaml",
+    ADAPTIVE: MODEL,
+    UNTRAINED: "",
+}
+"""What may be driven, by rising budget, and the files with its parameters.
 
-
+Rows have this order: that of measured costs would be another one each time.
+"""
+COST, ERROR = "cost [ms]", "error [%]"
+"""Columns of CPU time a scan, preparation included, and of the mean error."""
 MOST_SCANS = 600
 """Scans of a recording on which another odometry is tried: seconds."""
+_log = logging.getLogger(__name__)
 
 
 def another_odometry(study: Study, name: str) -> tuple[str, float]:
@@ -34,6 +52,7 @@ def another_odometry(study: Study, name: str) -> tuple[str, float]:
     scans, stamps, T_odom_sensor = study.sequences.open(name), [], []
     if (reference := scans.reference()) is None:
         return other, math.inf
+    _log.info("track is lost on %s: %s is tried there", name, other)
     tracker = Tracker(InProcess(odometry_class(other)()), study.config.health)
     for scan in islice(scans, MOST_SCANS):
         stamps.append(scan.stamp)
@@ -42,6 +61,39 @@ def another_odometry(study: Study, name: str) -> tuple[str, float]:
     errors = sub_trajectory_rte(T_ref_sensor, np.array(T_odom_sensor), study.config.sub_trajectory)
     known = cap(errors)[~np.isnan(errors)]
     return other, float(known.mean()) if len(known) else math.inf
+
+
+def lost_in_words(
+    study: Study, best: str, errors: Mapping[str, float], faults: Iterable[str] = ()
+) -> list[str]:
+    """A sentence where even the best does not track: the likeliest cause, and what to try.
+
+    `errors` has by sequence the mean error of the best, in percent; `faults` are what went wrong in
+    the odometry.
+    """
+    if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
+        return []
+    where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
+    lost = f"Even with {best} track is lost on {where}: RTE {mean:.1f} %. "
+    if fault := next(filter(None, faults), ""):
+        return [f"{lost}The odometry itself failed there: {fault}. Mend that first."]
+    worst = max(errors, key=lambda name: errors[name])
+    other, error = another_odometry(study, worst)
+    if error <= LOST_ABOVE:
+        return [
+            f"{lost}{other} holds track on {worst}, with {error:.2f} %: it is the odometry, not "
+            f"the data. Drive {other}, or widen the ranges of the parameters."
+        ]
+    if cause := hard_to_track(study.sequences.open(worst)):
+        help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
+        return [f"{lost}The likeliest cause: {cause}. {help_}."]
+    known = math.isfinite(error)
+    why = f"{other} loses it, too, so" if known else "the odometry does not suit the recording, or"
+    return [
+        f"{lost}The likeliest cause is none of the tuned parameters: {why} points' times, motion "
+        f"compensation, the range settings or the reference are wrong (`adaptune inspect --deep` "
+        f"checks the recording)."
+    ]
 
 
 class ModeError(AdaptuneError):

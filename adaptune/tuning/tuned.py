@@ -21,6 +21,7 @@ from adaptune.tuning.asked import Asked, check_guarded, named_odometry
 from adaptune.tuning.page import write_study_page
 from adaptune.tuning.studies import written
 from adaptune.tuning.verdict import write_verdict
+from offline.campaign import FITTING
 from offline.config import OfflineStudy
 from offline.scenario import scenario
 from offline.search import ELAPSED, Stopwatch
@@ -262,15 +263,15 @@ class OutOfTimeError(AdaptuneError):
 
 
 LATE = 1.05
-"""Times what is allowed, after which nothing but the comparison is done."""
+"""Times what is allowed, by which all is done, the comparison included."""
 
 
 def within(hours: float, clock: Stopwatch, show: Progress) -> Progress:
-    """Progress with an OutOfTimeError once the time is up."""
+    """Progress with an OutOfTimeError once there is just time for the comparison."""
 
     def shown(text: str, done: float, of: int, remark: str = "", /) -> None:
         show(text, done, of, remark)
-        if clock.hours > LATE * hours and done < of:
+        if clock.hours + FITTING / 3600.0 > LATE * hours and done < of:
             raise OutOfTimeError(f"{text}: does not fit into the time; allow more --minutes")
 
     return shown

@@ -11,9 +11,9 @@ from adaptune.files import write_text
 from adaptune.manifest import plain
 from adaptune.model.registry import ADAPTIVE
 from adaptune.report.tables import Listing
+from adaptune.study.driven import COST, ERROR, OWN
 from offline.choice import USUAL_BUDGET
 from offline.config import OfflineStudy
-from offline.front import COST, OWN
 from online.compare import ComparedReplays
 from online.modes import BASELINE
 
@@ -32,7 +32,7 @@ def front_table(
         low, high, file = row["low"], row["high"], row["file"]
         use = f"{'load' if file.endswith('.yaml') else 'run'} {file}" if file else None
         cell = {"choice": name + "*" * (row.get("driven on") == "training")}
-        cell |= {"RTE [%]": row["error [%]"]}
+        cell |= {"RTE [%]": row[ERROR]}
         cell["another drive"] = low and ("1" if low == high else f"{low:.2f}-{high:.2f}")
         cell |= {key: row[key] for key in (COST, "99 % [ms]", "memory [MB]") if key in row}
         cell["to drive it"] = "change nothing" if what == OWN else use
@@ -80,7 +80,7 @@ def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:
         "set": trial,
         "parameters": None if model is None or trial is None else model.sets[trial],
         "file": row.get("file") or None,
-        "error_percent": row.get("error [%]"),
+        "error_percent": row.get(ERROR),
         "cost_ms": row.get(COST),
         "ratio": ratio and ratio.value,
         "interval": ratio and ratio.interval,

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from adaptune.metrics import (
     absolute_error,
     kitti_error,
-    lost_in_words,
     relative_error,
     sub_trajectory_rte,
     travelled,
@@ -149,29 +148,6 @@ def test_an_estimate_that_is_not_finite_is_a_failure(bad):
     errors = sub_trajectory_rte(T_ref, T_est, 1.5)
     assert np.isinf(errors[[2, 4]]).all()
     assert np.isnan(errors).tolist() == [False] * 7 + [True] * 2
-
-
-def test_a_large_error_has_words():
-    def said(errors, odometry="ndt", **causes):
-        return lost_in_words("the best", errors, odometry, lambda worst: causes.get(worst, ""))
-
-    assert said({"one": 5.0}) == []
-    assert said({"one": math.nan}) == []
-    (words,) = said({"one": 1.0, "two": 10.0})
-    assert words.startswith("Even with the best track is lost on two: RTE 5.5 %. ")
-    assert "compare with `gicp`" in words
-    (words,) = said({"one": 9.0}, "gicp")
-    assert "compare with `kiss_icp`" in words
-    # The worst sequence tells.
-    (words,) = said({"one": 1.0, "two": 10.0}, two="night")
-    assert "The likeliest cause: night." in words
-    held = {"two": ("gicp", 0.619)}
-    (words,) = lost_in_words("x", {"two": 9.0}, "a", lambda _: "night", (), lambda name: held[name])
-    assert "gicp holds track on two, with 0.62 %: it is the odometry, not the data." in words
-    assert "night" not in words
-    held["two"] = ("gicp", 25.0)
-    (words,) = lost_in_words("x", {"two": 9.0}, "a", lambda _: "night", (), lambda name: held[name])
-    assert "The likeliest cause: night." in words
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.015, 0.05, 0.1])

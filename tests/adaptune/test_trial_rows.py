@@ -113,6 +113,6 @@ def test_each_of_several_odometries_has_a_row_the_best_first():
     assert [list(row.values()) for row in made.rows] == [
         ["ndt", 3.0, 1.0, 3, 13.0],
         ["gicp", 4.0, 2.0, 2, 12.0],
-        ["vgicp", None, None, None, None],
+        ["vgicp", None, None, 5, 15.0],
     ]
     assert by_odometry([row for row in table if row["odometry"] == "ndt"]) is None

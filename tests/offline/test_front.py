@@ -9,9 +9,10 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import Costs, SetCost
+from adaptune.study.driven import COST, FILES, OWN
 from offline.choice import BlockErrors
 from offline.config import load_study
-from offline.front import COST, OWN, left_out, measured_front, recommended
+from offline.front import left_out, measured_front, recommended
 
 
 @pytest.fixture
@@ -19,11 +20,13 @@ def study(study_file, trained_folder, tmp_path):
     return load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
 
 
-def test_the_front_rises_in_cost_and_marks_what_is_recommended(study):
+def test_the_front_has_the_order_of_budgets_and_marks_what_is_recommended(study):
     rows, model = json.loads((study.folder / "front.json").read_text("utf-8")), study.model()
     (chosen,) = (row for row in rows if row["recommended"])
     assert chosen["trial"] == (None if model.recommended == "adaptive" else model.fixed)
-    assert [row[COST] for row in rows] == sorted(row[COST] for row in rows)
+    least = [min(map([*FILES].index, row["what"].split(", "))) for row in rows]
+    assert least == sorted({*least})
+    assert least[0] == 0
     (base,) = (row for row in rows if OWN in row["what"])
     assert (base["trial"], base["vs baseline"]) == (0, 1.0)
     for row in rows:

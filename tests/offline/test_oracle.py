@@ -1,5 +1,4 @@
 import shutil
-from dataclasses import replace
 
 import fake_odometry
 import numpy as np
@@ -90,18 +89,16 @@ def test_each_of_several_odometries_is_run_on_the_test(study_file, tmp_path):
     rows = odometry_rows(study, training)
     tested = [row["test [%]"] for row in rows]
     assert tested == sorted(tested)
-    assert {(row["odometry"], row["parameters"]) for row in rows} >= {
-        (n, "its own") for n in ("one", "two")
+    assert {(row["odometry"], row["set"]) for row in rows} >= {
+        (n, "its own parameters") for n in ("one", "two")
     }
-    own = [row["vs one's own"] for row in rows if row["parameters"] == "its own"]
+    own = [row["vs one's own"] for row in rows if row["set"] == "its own parameters"]
     assert own == [1.0, 1.0]  # the same code
-    best = next(row for row in rows if row["parameters"] != "its own")
+    best = next(row for row in rows if row["set"] != "its own parameters")
     archive = study.archive("odometries")
     errors = cap(archive.read_errors("three", [best["_trial"]]))
     assert best["test [%]"] == pytest.approx(np.nanmean(errors))
     # What is there is not run again, and a single odometry has no such rows.
     assert odometry_rows(study, training) == rows
-    alone = replace(
-        study, config=study.config.model_copy(update={"odometry": study.config.odometries["one"]})
-    )
-    assert odometry_rows(alone, training) == []
+    alone = [row for row in training.trials if row["odometry"] == "one"]
+    assert odometry_rows(study, training._replace(trials=alone)) == []

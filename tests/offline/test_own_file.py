@@ -3,9 +3,9 @@ from drives import study_with
 
 from adaptune import yaml12
 from adaptune.space import ODOMETRY
+from adaptune.study.driven import ANY, EQUAL, FILES
 from adaptune.tuning.verdict import front_table
 from offline.config import load_study
-from offline.front import ANY, EQUAL, FILES
 from offline.train import write_sets
 
 ODOMETRIES = "odometry: [{name: gicp}, {name: kiss_icp}]\n"

@@ -2,6 +2,7 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import drives
@@ -13,6 +14,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.metrics import LOST_ABOVE
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import mean_errors
+from adaptune.study import driven
 from adaptune.study.driven import ModeError, another_odometry, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
@@ -40,7 +42,7 @@ def replayed(trained):
 
 
 def test_where_track_is_lost_nothing_is_advised_and_all_is_listed(replayed, monkeypatch):
-    monkeypatch.setattr("adaptune.metrics.LOST_ABOVE", -1.0)
+    monkeypatch.setattr("adaptune.study.driven.LOST_ABOVE", -1.0)
     found = compare(replayed)
     assert found.advised == NONE
     assert found.verdict[-1] == "Until then, rely on none."
@@ -57,6 +59,31 @@ def test_another_odometry_is_tried_where_track_is_lost(trained):
     assert another_odometry(replace(trained, config=config), "three")[0] == "kiss_icp"
 
 
+def test_where_track_is_lost_the_likeliest_cause_is_told(trained, monkeypatch):
+    causes, held = {"one": "night"}, {"one": 25.0, "two": 25.0, "three": np.inf}
+    monkeypatch.setattr(driven, "another_odometry", lambda _, name: ("gicp", held[name]))
+    monkeypatch.setattr(driven, "hard_to_track", lambda scans: causes.get(Path(scans.name).stem))
+
+    def said(*faults, **errors):
+        (words,) = driven.lost_in_words(trained, "x", errors, faults)
+        return words
+
+    for errors in ({"one": 5.0}, {"one": np.nan}):
+        assert driven.lost_in_words(trained, "x", errors) == []
+    # The worst sequence tells.
+    words = said(one=1.0, two=10.0)
+    assert words.startswith("Even with x track is lost on two: RTE 5.5 %. ")
+    assert "parameters: gicp loses it, too, so points' times" in words
+    assert "the odometry does not suit the recording, or points' times" in said(three=9.0)
+    assert "The likeliest cause: night." in said(one=10.0, two=1.0)
+    held["one"] = 0.619
+    words = said(one=10.0, two=1.0)
+    assert "gicp holds track on one, with 0.62 %: it is the odometry, not the data." in words
+    assert "night" not in words
+    words = said("", "it crashed", one=9.0)
+    assert words.endswith("The odometry itself failed there: it crashed. Mend that first.")
+
+
 def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, monkeypatch):
     assert not any("Doubt this" in said for said in compare(replayed).verdict)
     model = ErrorModel.load(replayed.model_path)
@@ -69,7 +96,7 @@ def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, 
 
 
 def test_where_track_is_lost_a_fault_of_the_odometry_is_named(own, monkeypatch):
-    monkeypatch.setattr("adaptune.metrics.LOST_ABOVE", -1.0)
+    monkeypatch.setattr("adaptune.study.driven.LOST_ABOVE", -1.0)
     monkeypatch.setattr("online.compare.LOST_ABOVE", -1.0)
     for path in (own.folder / "replays/three").glob("*/replay.json"):
         changed = json.loads(path.read_text()) | {"fault": "ValueError: matrix is singular"}

@@ -15,10 +15,10 @@ from adaptune.recording.bag import BagSource
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.study import loading
+from adaptune.study.driven import COST
 from adaptune.tuning import EACH, TRIALS, asked, studies, tuned
 from adaptune.yaml12 import Document
 from offline.config import load_study
-from offline.front import COST
 
 FAKE = ("--odometry", "fake_odometry:Fake")
 
@@ -243,8 +243,8 @@ def test_of_several_odometries_each_has_its_rows_on_the_test(monkeypatch):
     monkeypatch.setattr(
         "adaptune.commands.tune.show_table", lambda _, rows, *__: shown.extend(rows)
     )
-    row = {"parameters": "its own", COST: 12.0, "test [%]": 1.24, "_state": "complete"}
-    tuned = {"odometry": "ndt", "parameters": "trial 5", "_trial": 5, "test [%]": 0.62}
+    row = {"set": "its own parameters", COST: 12.0, "test [%]": 1.24, "_state": "complete"}
+    tuned = {"odometry": "ndt", "set": "trial 5", "_trial": 5, "test [%]": 0.62}
     lost = {"odometry": "mine:Icp", "_trial": 1, "test [%]": None, "_state": "failed: 10 faults"}
     of_each = [row | tuned, row | {"odometry": "gicp", "_trial": 0}, row | lost]
     training = SimpleNamespace(model=SimpleNamespace(allowed=lambda: (0, 1)))

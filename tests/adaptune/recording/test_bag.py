@@ -1,6 +1,7 @@
 import errno
 import re
 import resource
+import shutil
 import sqlite3
 from contextlib import closing
 
@@ -10,12 +11,14 @@ import numpy as np
 import pytest
 import rec
 from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.rosbag1.reader import decompressors
 from rosbags.typesys import get_types_from_msg
 from small_bag import START, cloud, pose, texts
 
 from adaptune.errors import AdaptuneError, MachineError
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.bag import BagSource, IndexReader
+from adaptune.recording.cache import cap, make_room
 from adaptune.recording.clouds import CLOUDS, LIVOX_TYPES
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
@@ -499,6 +502,39 @@ def test_a_bag_is_what_rosbags_reads(tmp_path, compression):
         for connection in theirs.connections:
             own = [c for c in ours.connections if c.id == connection.id]
             assert len(list(ours.messages(own))) == connection.msgcount
+
+
+def test_what_bz2_packs_is_unpacked_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("ADAPTUNE_CACHE", str(tmp_path / "cache"))
+    path, packed, unpack = many(tmp_path / "a.bag", "BZ2"), [], decompressors["bz2"]
+
+    def counted(data):
+        packed.append(data)
+        return unpack(data)
+
+    monkeypatch.setitem(decompressors, "bz2", counted)
+    first = list(opened(path, cache=True))
+    n = len(packed)
+    assert len(packed) == len({*packed}) > 3
+    other = opened(path, cache=True, stop=1.0, reference="/1")  # is decoded anew
+    assert same(list(other), first[:10])
+    assert other.reference() is not None
+    assert len(packed) == n
+    # What is unpacked is removed as other entries are.
+    (entry,) = {file.parent for file in (tmp_path / "cache").glob("*/*") if file.stem.isdigit()}
+    shutil.rmtree(entry)
+    list(opened(path, cache=True, stop=2.0))  # reads no chunk after that
+    assert n < (again := len(packed)) < 2 * n
+    make_room(cap())
+    assert not entry.exists()
+    # A bag that may not fit is not kept, nor what a study wants to have no cache.
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", str(2e-9 * path.stat().st_size))
+    list(opened(path, cache=True))
+    assert not entry.exists()
+    monkeypatch.delenv("ADAPTUNE_CACHE_GB")
+    list(opened(path))
+    assert not entry.exists()
+    assert len(packed) >= again + 2 * n
 
 
 def test_only_chunks_of_the_time_are_looked_up(tmp_path):
