@@ -98,13 +98,13 @@ def _on_robot(
     *,
     ros2: bool,
 ) -> None:
-    from pydantic import ValidationError
+    from pydantic import TypeAdapter, ValidationError
 
     from adaptune.machine import pin
     from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
     from adaptune.strict import in_one_line
-    from adaptune.study.config import SteerConfig
+    from adaptune.study.config import RosName
     from online.watch import watch_topics
 
     def tell(one: "Told") -> None:
@@ -115,13 +115,12 @@ def _on_robot(
         error = f", error {one.error:.2f} %" if math.isfinite(one.error) else ""
         show("watching", len(told), len(told), one.state + error)
 
-    place = tuple(map(tuple, by.T_body_sensor.tolist()))
     try:
-        settings = SteerConfig(node=odometry, odometry=odometry, extrinsic=place)
+        TypeAdapter(RosName).validate_python(odometry)
     except ValidationError as error:
         raise AdaptuneError(f"--odometry {odometry}: {in_one_line(error)}") from error
     with ExitStack() as stack:
         link = stack.enter_context(closing(local_ros2() if ros2 else local_ros1()))
         stack.enter_context(pin(os.getpid(), alone=True))
         log.info("watch, %s: Ctrl-C ends it", odometry)
-        watch_topics(link, points, settings, length, tell)
+        watch_topics(link, points, odometry, by.T_body_sensor, length, tell)

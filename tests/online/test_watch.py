@@ -1,4 +1,5 @@
 import csv
+import threading
 
 import drives
 import local_link
@@ -8,8 +9,10 @@ from rooms import moved, scan_at, street
 from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
+from adaptune.errors import warn_once
 from adaptune.recording.scan import Scan
-from adaptune.study.config import SteerConfig
+from adaptune.ros.link import LinkError
+from online import watch
 from online.watch import Watch, in_words, watch_topics
 
 STEP = 0.15
@@ -102,7 +105,9 @@ def test_what_is_wrong_is_told(bag, words, says):  # noqa: ARG001
     assert says in str(result.exception) + result.output
 
 
-def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics():
+def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics(monkeypatch):
+    monkeypatch.setattr(watch, "PATIENCE", 60.0)
+    monkeypatch.setattr(watch, "WAITING", 0)  # all may wait
     played, told = drives.scans(4, 30), []
 
     def messages():
@@ -117,10 +122,38 @@ def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics():
             raise KeyboardInterrupt
 
     link = local_link.LocalLink(messages())
-    settings = SteerConfig(node="/odom", odometry="/odom", patience=60.0)
-    watch_topics(link, "/points", settings, 5.0, tell, queue=0)
+    watch_topics(link, "/points", "/odom", np.eye(4), 5.0, tell)
     assert [one.state for one in told[:2]] == ["unknown", "unknown"]
     first = link.published["/diagnostics"][0].status[0]
     assert (first.level, first.name) == (1, "adaptune: /odom")
     assert {pair.key for pair in first.values} >= {"state", "restarts"}
     assert not link.holds  # it sets no parameter
+
+
+def test_poses_that_come_late_are_told_in_words_of_a_listener(monkeypatch, caplog):
+    warn_once.cache_clear()
+    monkeypatch.setattr(watch, "PATIENCE", 0.0)
+    monkeypatch.setattr(watch, "WAITING", 0)
+    monkeypatch.setattr("online.live.SILENCE", 0.1)
+    played = drives.scans(4, 30)
+
+    def messages():
+        for stamp, points, _ in played:
+            yield "/points", local_link.cloud(stamp, points)
+        finished.wait()
+        for stamp, _, T in played:
+            yield "/odom", local_link.odometry(stamp, T)
+        link.alive = False
+
+    told, finished, link = [], threading.Event(), local_link.LocalLink(messages())
+
+    def tell(one):
+        told.append(one)
+        if len(told) == 3:
+            finished.set()
+
+    with pytest.raises(LinkError):
+        watch_topics(link, "/points", "/odom", np.eye(4), 5.0, tell)
+    assert told[-1].state == "lost"
+    assert "come later than 0 s after their scans, and are not used" in caplog.text
+    assert "patience" not in caplog.text
