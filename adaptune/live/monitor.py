@@ -125,10 +125,18 @@ class HealthMonitor:
             self._steps.append(_Step(seconds, False))
             return
         best = max(found, key=lambda hop: hop.inliers)
-        # Where a place repeats itself, another motion looks as well.
-        best = found[0] if best.inliers < found[0].inliers + BETTER else best
+        # Where a place repeats itself, another motion looks as well; one that is known counts more.
+        tells = np.trace(best.projection) > np.trace(found[0].projection) + 0.5
+        best = best if tells or best.inliers >= found[0].inliers + BETTER else found[0]
         self._measured = best.T_start_end, took
-        self._steps.append(_Step(seconds, True, _contradicts(T, best, took), _is_known(T, best)))
+        off = _contradicts(T, best, took)
+        # Along a place that shows nothing, scans look as if the sensor stood still.
+        if off and np.linalg.norm(best.T_start_end[:3, 3]) < np.linalg.norm(T[:3, 3]):
+            there = register(begin[1], cloud, [T], iterations=1)
+            if there is not None:
+                best = best._replace(projection=there.projection @ best.projection)
+                off = _contradicts(T, best, took)
+        self._steps.append(_Step(seconds, True, off, _is_known(T, best)))
 
     def health(self, wrong: int = 0, rejected: int = 0) -> Health:
         """The state now; so many hops in a row were `wrong` by much, or `rejected`."""
@@ -187,7 +195,6 @@ def _contradicts(T_odom: Poses, hop: Hop, took: float) -> str:
 def _is_known(T_odom: Poses, hop: Hop) -> bool:
     """Whether a registration tells how far the sensor moved: in a corridor it may not."""
     step = T_odom[:3, 3]
-    way = float(np.linalg.norm(step))
-    if way < OFF:
+    if float(np.linalg.norm(step)) < OFF:
         return float(np.trace(hop.projection)) > 2.5
-    return float(np.linalg.norm(hop.projection @ step)) > 0.7 * way
+    return hop.shows(step)

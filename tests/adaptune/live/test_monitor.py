@@ -90,6 +90,12 @@ def test_a_tunnel_tells_nothing():
     assert {one.state for one in found[2:]} == {"unknown"}
 
 
+def test_a_tunnel_that_looks_alike_everywhere_tells_nothing():
+    """Its scans are those of a sensor that stands, and the odometry is not to blame."""
+    found = states(right, see=lambda i: scan_at(tunnel(), 0.0, seed=i))
+    assert {one.state for one in found[2:]} == {"unknown"}
+
+
 def test_no_pose_and_many_restarts_are_loss():
     gone = states(lambda i: np.full((4, 4), np.nan) if i > 40 else right(i))
     assert gone[6].why.startswith("no pose for")
