@@ -6,6 +6,7 @@ reach over a sub-trajectory, where the odometry's errors are several times the c
 """
 
 from collections import deque
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +27,9 @@ LOG_DEVIATION = 0.3
 scaled to e times the metres of its chains."""
 SCATTER = 0.6
 """Standard deviation of the logarithm of the error from one sub-trajectory to the next."""
-HOP_ERROR = 0.05
-"""Metres by which a hop itself is wrong where registrations are worst, as among plants."""
+HOP_ERROR, WORST_HOP = 0.05, 0.07
+"""Metres by which a hop itself may be wrong where no others tell, and where hops are worst."""
+FEWEST_PAIRS = 4  # of hops that overlap by half, from which on they tell how wrong they are
 HIDDEN = 0.0075  # metres of an odometry's error that a hop may have, too, and so hide
 PREDICTED_WINDOWS = 2.0  # how many chains that do not overlap a prediction from training counts as
 DEVIATION, COMMON = 0.64, 0.1
@@ -118,7 +120,7 @@ class OwnErrors:
         factor = float(np.exp(1.96 * deviation))
         # Some of it, or all, may be what the hops are wrong by.
         of_a_metre = times**GROWTH * float((100.0 * np.sqrt(hops) / reach).mean())
-        low = float(np.sqrt(max(0.0, mean**2 - (HOP_ERROR * of_a_metre) ** 2))) / factor
+        low = float(np.sqrt(max(0.0, mean**2 - (self._hop_error() * of_a_metre) ** 2))) / factor
         return OwnError(mean, low, float(np.hypot(mean * factor, HIDDEN * of_a_metre)))
 
     def estimate_with(self, predicted: float, share: float) -> OwnError | None:
@@ -136,6 +138,19 @@ class OwnErrors:
         variance = DEVIATION**2 * (1.0 / (n + prior) + COMMON)
         factor = float(np.exp(1.96 * np.sqrt(variance + (LOG_DEVIATION * np.log(times)) ** 2)))
         return OwnError(mean, mean / factor, mean * factor)
+
+    def _hop_error(self) -> float:
+        """Metres by which hops are wrong: where two overlap, the odometry errs about alike."""
+        apart = [
+            _wrong(link) - _wrong(before)
+            for before, link in pairwise(self._links)
+            if before.end - link.start > 0.5 * max(before.end - before.start, link.end - link.start)
+        ]
+        if self._whole or len(apart) < FEWEST_PAIRS:
+            return HOP_ERROR
+        return float(
+            np.clip(np.sqrt(0.5 * (np.array(apart) ** 2).sum() / len(apart)), HIDDEN, WORST_HOP)
+        )
 
     def _long_chains(self) -> tuple[NDArray[np.float64], float]:
         """Starts, ends, errors and hops of the long chains, and the length in theirs."""
@@ -168,6 +183,12 @@ def _chain(links: deque[Link], length: float) -> _Chain:
     # Between the hops it errs, too, and not in the same direction.
     error *= float(np.sqrt((newest.end - first.start) / covered))
     return _Chain(first.start, newest.end, newest.seconds, error, n)
+
+
+def _wrong(link: Link) -> NDArray[np.float64]:
+    """What the odometry's motion differs by from the hop's, in metres, of shape (3,)."""
+    T_odom = invert(link.T_odom_start) @ link.T_odom_end
+    return np.asarray(T_odom[:3, 3] - _completed(link)[:3, 3])
 
 
 def _completed(link: Link) -> Poses:
