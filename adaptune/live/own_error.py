@@ -27,7 +27,7 @@ LOG_DEVIATION = 0.3
 scaled to e times the metres of its chains."""
 SCATTER = 0.6
 """Standard deviation of the logarithm of the error from one sub-trajectory to the next."""
-HOP_ERROR, WORST_HOP = 0.05, 0.07
+HOP_ERROR, WORST_HOP = 0.05, 0.1
 """Metres by which a hop itself may be wrong where no others tell, and where hops are worst."""
 FEWEST_PAIRS = 4  # of hops that overlap by half, from which on they tell how wrong they are
 HIDDEN = 0.0075  # metres of an odometry's error that a hop may have, too, and so hide
@@ -68,6 +68,7 @@ class _Chain(NamedTuple):
     seconds: float
     error: float  # metres
     hops: int  # how many
+    covered: float  # metres that they cover
 
 
 class OwnErrors:
@@ -109,12 +110,12 @@ class OwnErrors:
         """The mean error over the last chains; None without any."""
         if not self._chains:
             return None
-        (start, end, error, hops), times = self._long_chains()
+        (start, end, error, hops, covered), times = self._long_chains()
         reach = end - start
         mean = times**GROWTH * float((100.0 * error / reach).mean())
         n = windows(start, end)
-        # What no chain covers may be another sort of place.
-        missed = max(0.0, 1.0 - n * float(reach.mean()) / float(end.max() - start.min()))
+        # What no hop covers may be another sort of place.
+        missed = max(0.0, 1.0 - n * float(covered.mean()) / float(end.max() - start.min()))
         of_one = LOG_DEVIATION**2 + SCATTER**2 * missed
         deviation = np.sqrt(of_one / n + (LOG_DEVIATION * np.log(times)) ** 2)
         factor = float(np.exp(1.96 * deviation))
@@ -131,7 +132,7 @@ class OwnErrors:
         """
         if not self._chains:
             return None
-        (start, end, error, _), times = self._long_chains()
+        (start, end, error, *_), times = self._long_chains()
         measured = np.log(np.maximum(LEAST, times**GROWTH * 100.0 * error / (end - start))).mean()
         n, prior = windows(start, end), PREDICTED_WINDOWS * share
         mean = float(np.exp((n * measured + prior * np.log(max(LEAST, predicted))) / (n + prior)))
@@ -153,14 +154,14 @@ class OwnErrors:
         )
 
     def _long_chains(self) -> tuple[NDArray[np.float64], float]:
-        """Starts, ends, errors and hops of the long chains, and the length in theirs."""
-        start, end, _, error, hops = np.array(self._chains).T
+        """Starts, ends, errors, hops and covers of long chains, and the length in theirs."""
+        start, end, _, *others = np.array(self._chains).T
         reach = end - start
         # Of a whole recording, the last chain may be a short one.
         usual = float(reach.max() if self._whole else reach[-1])
         long = reach >= MIN_REACH * min(self._length, usual)
         times = max(1.0, self._length / float(reach[long].mean()))
-        return np.stack([start, end, error, hops])[:, long], times
+        return np.stack([start, end, *others])[:, long], times
 
 
 def _chain(links: deque[Link], length: float) -> _Chain:
@@ -182,7 +183,7 @@ def _chain(links: deque[Link], length: float) -> _Chain:
     error = float(np.linalg.norm(T_odom[:3, 3] - T[:3, 3]))
     # Between the hops it errs, too, and not in the same direction.
     error *= float(np.sqrt((newest.end - first.start) / covered))
-    return _Chain(first.start, newest.end, newest.seconds, error, n)
+    return _Chain(first.start, newest.end, newest.seconds, error, n, covered)
 
 
 def _wrong(link: Link) -> NDArray[np.float64]:
