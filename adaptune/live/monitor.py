@@ -6,7 +6,7 @@ hops say (`adaptune.live.evidence`), count beside it.
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -140,43 +140,38 @@ class HealthMonitor:
 
     def health(self, wrong: int = 0, rejected: int = 0) -> Health:
         """The state now; so many hops in a row were `wrong` by much, or `rejected`."""
+        return next(self._found(wrong, rejected))
+
+    def _found(self, wrong: int, rejected: int) -> Iterator[Health]:
+        """What speaks against it, the worst first."""
         held = max(HELD, 2.0 * self._period)
         # Where nothing is in doubt, seconds are compared seldom.
         until = self._steps[-1].seconds if self._steps else self._now
         steps = [step for step in self._steps if until - step.seconds <= 2.0 * held]
         last = [step for step in steps if until - step.seconds <= held]
-        if why := next(self._losses(steps, wrong), ""):
-            return Health("lost", why)
-        if why := next(self._doubts(last, held, wrong, rejected), ""):
-            return Health("doubtful", why)
-        if not any(step.known for step in last):
-            return Health("unknown", "the scans do not tell its motion" if self._steps else "")
-        return Health("good")
-
-    def _losses(self, steps: Sequence[_Step], wrong: int) -> Iterator[str]:
         if (seconds := self._now - self._posed) > max(NO_POSE, 2.0 * self._period):
-            yield f"no pose for {seconds:.1f} s"
+            yield Health("lost", f"no pose for {seconds:.1f} s")
         if sum(self._now - at <= STARTS_SECONDS for at in self._starts) >= STARTS:
-            yield f"{STARTS} impossible motions or more within {STARTS_SECONDS:g} s"
+            often = f"{STARTS} impossible motions or more within {STARTS_SECONDS:g} s"
+            yield Health("lost", often)
         off = [step.off for step in steps if step.accepted][-2:]
         if len(off) == 2 and all(off):
-            yield off[-1]
+            yield Health("lost", off[-1])
         if wrong >= HOPS_TO_BE_LOST:
-            yield "registrations over 10 m contradict its motion"
-
-    def _doubts(
-        self, last: Sequence[_Step], held: float, wrong: int, rejected: int
-    ) -> Iterator[str]:
+            yield Health("lost", "registrations over 10 m contradict its motion")
         if self._starts and self._now - self._starts[-1] <= held:
-            yield "its motion was impossible"
-        yield from (step.off for step in reversed(last) if step.off)
+            yield Health("doubtful", "its motion was impossible")
+        yield from (Health("doubtful", step.off) for step in reversed(last) if step.off)
         if self._odd is not None:
-            yield self._odd[1]
+            yield Health("doubtful", self._odd[1])
         if wrong or rejected >= HOPS_TO_BE_LOST:
-            yield "registrations over 10 m do not confirm its motion"
+            yield Health("doubtful", "registrations over 10 m do not confirm its motion")
         accepted = [step.accepted for step in self._steps]
         if len(accepted) > LEAST_STEPS and np.mean(accepted) >= USUALLY and not accepted[-1]:
-            yield "scans of a second cannot be registered any more"
+            yield Health("doubtful", "scans of a second cannot be registered any more")
+        if not any(step.known for step in last):
+            yield Health("unknown", "the scans do not tell its motion" if self._steps else "")
+        yield Health("good")
 
 
 def _contradicts(T_odom: Poses, hop: Hop, took: float) -> str:
