@@ -344,7 +344,7 @@ def main() -> None:
     parser.add_argument("--drifts", type=int, default=60)
     parser.add_argument("--slides", type=int, default=12)
     parser.add_argument("--columns", type=int, help="of the simulated sensor")
-    parser.add_argument("--scenes", nargs="+", default=SCENES)
+    parser.add_argument("--scenes", nargs="*", default=SCENES)
     parser.add_argument("--states", action="store_true", help="only states, not intervals")
     given = parser.parse_args()
     rng, faults, drifts = np.random.default_rng(0), dict[str, list](), dict[str, list[float]]()
@@ -364,7 +364,7 @@ def main() -> None:
         sums += [drive.seconds[-1] * x for x in (1.0, *shares[1:], np.nan_to_num(vain))]
         cells += f"  {vain:6.1%}  {core:6.1%}"
         print(f"{drive.name:12} {drive.seconds[-1]:3.0f}  {cells}  {holds}", flush=True)
-    rest = "  ".join(f"{share:6.2%}" for share in sums[1:] / sums[0])
+    rest = "  ".join(f"{share:6.2%}" for share in sums[1:] / max(sums[0], 1.0))
     print(f"{sums[0] / 60.0:.1f} minutes: unknown, doubtful, lost, in vain {rest}", flush=True)
     for i in range(given.planted):
         kind, drive = list(FAULTS)[i % len(FAULTS)], every[i // len(FAULTS) % len(every)]
