@@ -209,21 +209,10 @@ class LiveScans:
 
 
 class LivePoses:
-    """Poses of a LiDAR by an odometry that runs elsewhere, of shape (4, 4).
+    """Poses of a LiDAR, of shape (4, 4), by an odometry on a `topic` (nav_msgs/Odometry).
 
-    Parameters
-    ----------
-    link
-        To the robot.
-    topic
-        Where it publishes them, as nav_msgs/Odometry.
-    T_base_sensor
-        The LiDAR's pose in the frame whose poses it publishes.
-    points
-        Topic of the point clouds that it hears.
-    late
-        What the log says of poses that come later than one waits for them: than what, and what to
-        do about it.
+    `T_base_sensor` is the LiDAR's pose in the frame whose poses it publishes, `points` the topic of
+    the clouds that it hears. `late` ends what the log says of poses that "come later than".
     """
 
     def __init__(self, link: RosLink, topic: str, T_base_sensor: Poses, points: str, late: str):
