@@ -3,7 +3,7 @@
 import csv
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -90,14 +90,9 @@ class Watch:
 
 
 def watch_topics(
-    link: RosLink,
-    points: str,
-    odometry: str,
-    T_base_sensor: Poses,
-    length: float,
-    tell: Callable[[Told], None],
-) -> None:
-    """Watch a node on a robot until Ctrl-C; where the clock goes back, all begins anew.
+    link: RosLink, points: str, odometry: str, T_base_sensor: Poses, length: float
+) -> Iterator[Told]:
+    """Watch a node on a robot; where the clock goes back, all begins anew.
 
     `odometry` is the topic of its poses, `T_base_sensor` the LiDAR's in the frame that they are of.
     What is told is published as diagnostics, too.
@@ -107,16 +102,13 @@ def watch_topics(
     late = f"{PATIENCE:g} s after their scans, and are not used: let less run on this machine"
     poses = LivePoses(link, odometry, T_base_sensor, points, late)
     scans = LiveScans(link, points, Timing(), WAITING)
-    try:
-        while not scans.stopped:
-            watch = Watch(length)
-            for scan, came, _ in scans.arrivals():
-                T = poses.at(scan.stamp, max(0.0, came + PATIENCE - time.perf_counter()))
-                if (told := watch.see(scan, T)) is not None:
-                    tell(told)
-                    publish(messages.diagnostics(told.stamp, odometry, *_shown(told)))
-    except KeyboardInterrupt:
-        scans.stop()
+    while not scans.stopped:
+        watch = Watch(length)
+        for scan, came, _ in scans.arrivals():
+            T = poses.at(scan.stamp, max(0.0, came + PATIENCE - time.perf_counter()))
+            if (told := watch.see(scan, T)) is not None:
+                publish(messages.diagnostics(told.stamp, odometry, *_shown(told)))
+                yield told
 
 
 def _shown(told: Told) -> tuple[int, str, dict[str, str]]:
@@ -137,23 +129,19 @@ def write_told(path: Path, told: Iterable[Told]) -> None:
 
 
 def in_words(told: list[Told]) -> list[str]:
-    """Whether to believe the odometry, in at most four sentences."""
+    """Whether to believe the odometry, in at most three sentences."""
     if len(told) < 2:
         return ["Too short to tell: give two seconds of scans at least."]
     spans = [(one, after.seconds - one.seconds) for one, after in pairwise(told)]
     total = told[-1].seconds - told[0].seconds
-    known: dict[State, float] = {}
-    for one, seconds in spans:
-        known[one.state] = known.get(one.state, 0.0) + seconds
-    said = []
     begins: dict[State, str] = {"lost": "Do not rely on it", "doubtful": "Look at it"}
+    said = []
     for state, first in begins.items():
-        if seconds := known.get(state, 0.0):
-            begin = next(one for one, _ in spans if one.state == state)
-            what = f"{first}: it is {state} for {seconds:.0f} s of {total:.0f}"
-            said.append(f"{what}, first at {begin.seconds:.1f} s: {begin.why}.")
+        if within := [(one, seconds) for one, seconds in spans if one.state == state]:
+            what = f"{first}: it is {state} for {sum(s for _, s in within):.0f} s of {total:.0f}"
+            said.append(f"{what}, first at {within[0][0].seconds:.1f} s: {within[0][0].why}.")
     if not said:
-        unknown = known.get("unknown", 0.0)
+        unknown = sum(seconds for one, seconds in spans if one.state == "unknown")
         said = [f"Nothing speaks against it in {total:.0f} s, {unknown:.0f} of them unknown."]
     errors = [one.error for one in told if math.isfinite(one.error)]
     if errors:

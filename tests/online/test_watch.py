@@ -1,5 +1,6 @@
 import csv
 import threading
+from itertools import islice
 
 import drives
 import local_link
@@ -89,6 +90,21 @@ def test_what_was_told_is_kept_where_the_robot_goes_away(bag, monkeypatch):
     assert list(csv.DictReader((bag.parent / "watch.csv").open()))
 
 
+def test_ctrl_c_ends_it(bag, monkeypatch):
+    def watched_until_interrupted(*_):
+        yield from watched(n=41)
+        raise KeyboardInterrupt
+
+    link = local_link.LocalLink()
+    monkeypatch.setattr("adaptune.ros.ros2.local_ros2", lambda: link)
+    monkeypatch.setattr(watch, "watch_topics", watched_until_interrupted)
+    words = ["watch", "--ros2", "--points", "/points", "--odometry", "/odom"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert "Nothing speaks against it in 4 s" in result.output
+    assert len(list(csv.DictReader((bag.parent / "watch.csv").open()))) == 5
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -108,7 +124,7 @@ def test_what_is_wrong_is_told(bag, words, says):  # noqa: ARG001
 def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics(monkeypatch):
     monkeypatch.setattr(watch, "PATIENCE", 60.0)
     monkeypatch.setattr(watch, "WAITING", 0)  # all may wait
-    played, told = drives.scans(4, 30), []
+    played = drives.scans(4, 30)
 
     def messages():
         for i, (stamp, points, T) in enumerate(played):
@@ -116,13 +132,8 @@ def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics(monkeypatch):
             yield "/odom", local_link.odometry(stamp, still if i > 18 else T)
             yield "/points", local_link.cloud(stamp, points)
 
-    def tell(one):
-        told.append(one)
-        if len(told) == 3:
-            raise KeyboardInterrupt
-
     link = local_link.LocalLink(messages())
-    watch_topics(link, "/points", "/odom", np.eye(4), 5.0, tell)
+    told = list(islice(watch_topics(link, "/points", "/odom", np.eye(4), 5.0), 3))
     assert [one.state for one in told[:2]] == ["unknown", "unknown"]
     first = link.published["/diagnostics"][0].status[0]
     assert (first.level, first.name) == (1, "adaptune: /odom")
@@ -145,15 +156,12 @@ def test_poses_that_come_late_are_told_in_words_of_a_listener(monkeypatch, caplo
             yield "/odom", local_link.odometry(stamp, T)
         link.alive = False
 
-    told, finished, link = [], threading.Event(), local_link.LocalLink(messages())
-
-    def tell(one):
-        told.append(one)
-        if len(told) == 3:
-            finished.set()
-
+    finished, link = threading.Event(), local_link.LocalLink(messages())
+    every = watch_topics(link, "/points", "/odom", np.eye(4), 5.0)
+    *_, last = islice(every, 3)
+    finished.set()
     with pytest.raises(LinkError):
-        watch_topics(link, "/points", "/odom", np.eye(4), 5.0, tell)
-    assert told[-1].state == "lost"
+        list(every)
+    assert last.state == "lost"
     assert "come later than 0 s after their scans, and are not used" in caplog.text
     assert "patience" not in caplog.text
