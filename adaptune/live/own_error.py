@@ -27,8 +27,8 @@ LOG_DEVIATION = 0.3
 scaled to e times the metres of its chains."""
 SCATTER = 0.6
 """Standard deviation of the logarithm of the error from one sub-trajectory to the next."""
-HOP_ERROR, WORST_HOP = 0.05, 0.1
-"""Metres by which a hop itself may be wrong where no others tell, and where hops are worst."""
+HOP_ERROR = 0.05
+"""Metres by which a hop itself may be wrong at most, and where no others tell."""
 FEWEST_PAIRS = 4  # of hops that overlap by half, from which on they tell how wrong they are
 HIDDEN = 0.0075  # metres of an odometry's error that a hop may have, too, and so hide
 PREDICTED_WINDOWS = 2.0  # how many chains that do not overlap a prediction from training counts as
@@ -150,7 +150,7 @@ class OwnErrors:
         if self._whole or len(apart) < FEWEST_PAIRS:
             return HOP_ERROR
         return float(
-            np.clip(np.sqrt(0.5 * (np.array(apart) ** 2).sum() / len(apart)), HIDDEN, WORST_HOP)
+            np.clip(np.sqrt(0.5 * (np.array(apart) ** 2).sum() / len(apart)), HIDDEN, HOP_ERROR)
         )
 
     def _long_chains(self) -> tuple[NDArray[np.float64], float]:
