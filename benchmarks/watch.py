@@ -1,13 +1,19 @@
 """How soon a watched odometry is in doubt where something is wrong, and how often where not.
 
-    python benchmarks/watch.py [FOLDER] [--metres 100] [--planted 100] [--drifts 60]
+    python benchmarks/watch.py [FOLDER] [--metres 100] [--planted 100] [--drifts 60] [--columns 450]
 
 GICP with its own parameters drives along simulated courses, and along the recordings of a folder.
 The first table has the share of the time in each state, in doubt in vain (no second of the last
 four was wrong by much), what watching takes of a core, and how often the interval holds the true
-mean error of the last half minute. Then faults are planted into poses, or into the scans that GICP
-gets: how many are in doubt within two seconds or five metres, and after how long. And drifts: after
-how many metres the interval leaves what was told before.
+mean error of the metres that it is told of: watched; of a single set and of a bank of three,
+measured once a second over the last minute; and of the single set with restarts planted. Where the
+reference is as wrong as the odometry, nobody can tell (-).
+
+Then faults are planted into poses, or into the scans that GICP gets: how many are in doubt within
+two seconds or five metres, and after how long. And drifts: after how many metres the interval
+leaves what was told before; also a slide along a smooth corridor whose ends are in sight. Last, the
+share of the time that one is unknown whose ends are not. With fewer columns a sensor is quicker
+simulated.
 """
 
 import argparse
@@ -19,15 +25,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert, rotation_angle
+from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
+from adaptune.live.evidence import LiveEvidence
+from adaptune.live.own_error import OWN_SECONDS
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
+from adaptune.odometry.base import Motions
 from adaptune.odometry.registry import odometry_class
+from adaptune.paired import ERROR_FACTOR
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import Scan
+from adaptune.reference.check import measure_reference
 from adaptune.simulation import Course
+from adaptune.simulation.course import directions
 from adaptune.simulation.record import simulate
-from online.watch import Told, Watch
+from adaptune.space import ParameterSet
+from online.watch import WINDOW, Told, Watch
 
 RECORDINGS = ("town", "street", "road", "city", "hall")
 SCENES = ("street", "mine", "open", "garden")
@@ -36,6 +49,14 @@ WRONG = 0.2, 3.0
 """Metres, and degrees, of a second from which an odometry is rightly doubted."""
 SOON, NEAR = 2.0, 5.0
 """Seconds, and metres, within which a fault is to be noticed."""
+OTHERS: Sequence[ParameterSet] = (
+    {"max_correspondence_distance": 1.5, "keyframe_interval": 2.0},
+    {"max_correspondence_distance": 3.0, "keyframe_interval": 1.0, "downsampling": 0.7},
+)
+"""Members of a bank, beside the odometry's own parameters."""
+METRES = 30.0  # over which errors are told at least
+SPEED, AROUND = 1.5, (1.5, 1.4)
+"""Metres a second along a corridor, and half of its width and height."""
 
 
 class Driven(NamedTuple):
@@ -45,6 +66,7 @@ class Driven(NamedTuple):
     scans: Sequence[Scan]
     T_odom_sensor: Poses
     T_ref_sensor: Poses | None
+    reference_error: float = 0.0  # percent
 
     @property
     def seconds(self) -> np.ndarray:
@@ -53,28 +75,31 @@ class Driven(NamedTuple):
         return (stamps - stamps[0]) * 1e-9
 
 
-def odometry(scans: Sequence[Scan]) -> Poses:
+def odometry(scans: Sequence[Scan], parameters: ParameterSet | None = None) -> Poses:
     """Poses of GICP, which nothing restarts."""
-    gicp = odometry_class("gicp")()
+    cls = odometry_class("gicp")
+    gicp = cls(cls.space.baseline | (parameters or {}))
     gicp.start(gicp.prepare(scans[0]), np.eye(4))
     return np.array([np.eye(4), *(gicp.register(gicp.prepare(s)).T_odom_sensor for s in scans[1:])])
 
 
-def drives(folder: Path | None, metres: float, seeds: Sequence[int]) -> Iterator[Driven]:
+def drives(given: argparse.Namespace) -> Iterator[Driven]:
     """All drives, one after the other."""
-    for seed in seeds:
-        for scene in SCENES:
-            course = Course(scenes=(scene,), length=metres, seed=seed)
+    folder, metres = given.folder, given.metres
+    for seed in given.seeds:
+        for scene in given.scenes:
+            course = Course(scenes=(scene,), length=metres, seed=seed, columns=given.columns)
             scans = list(simulate(course))
             T = np.array([scan.T_world_sensor for scan in scans])
             yield Driven(f"{scene} {seed}", scans, odometry(scans), T)
     for name in RECORDINGS if folder else ():
-        sequence = RecordedSequence(inspect(Path(folder or "", f"{name}.bag")).config())
+        sequence = RecordedSequence(inspect(folder / f"{name}.bag").config())
         scans = list(sequence)
         reference = sequence.reference()
         stamps = np.array([scan.stamp for scan in scans])
         T_ref = None if reference is None else reference.at(stamps)
-        yield Driven(name, scans, odometry(scans), T_ref)
+        own = None if reference is None else measure_reference(sequence, reference).error(LENGTH)
+        yield Driven(name, scans, odometry(scans), T_ref, own.mean if own else 0.0)
 
 
 def told(scans: Sequence[Scan], T_odom_sensor: Poses) -> list[Told]:
@@ -200,20 +225,111 @@ def in_vain(drive: Driven, found: Sequence[Told]) -> float:
     return float(np.mean(vain))
 
 
-def held(drive: Driven, found: Sequence[Told]) -> list[bool]:
-    """Whether each interval holds the mean error of sub-trajectories of the last half minute."""
-    if drive.T_ref_sensor is None:
+Interval = tuple[float, float, float]
+"""Seconds since the first scan, and the ends."""
+
+
+def held(
+    drive: Driven, T_odom_sensor: Poses, found: Sequence[Interval], window: float
+) -> list[bool]:
+    """Whether intervals hold the mean error of the sub-trajectories that they are told of."""
+    T_ref, seconds = drive.T_ref_sensor, drive.seconds
+    if T_ref is None:
         return []
-    rte = cap(sub_trajectory_rte(drive.T_ref_sensor, drive.T_odom_sensor, LENGTH))
-    metres, seconds = travelled(drive.T_ref_sensor), drive.seconds
+    rte = cap(sub_trajectory_rte(T_ref, T_odom_sensor, LENGTH))
+    if np.nanmean(rte) < ERROR_FACTOR * drive.reference_error:
+        return []
+    metres = travelled(T_ref)
     end = np.searchsorted(metres, metres + LENGTH).clip(max=len(metres) - 1)
     inside = []
-    for one in found:
-        behind = (seconds[end] <= one.seconds) & (seconds[end] > one.seconds - 30.0)
-        true = rte[behind & ~np.isnan(rte)]
-        if len(true) and np.isfinite(one.error):
-            inside.append(bool(one.low <= true.mean() <= one.high))
+    for now, low, high in found:
+        recent = seconds[end] > now - window
+        near = metres >= np.interp(now, seconds, metres) - METRES
+        true = rte[(seconds[end] <= now) & (recent | near) & ~np.isnan(rte)]
+        if len(true) and np.isfinite(high):
+            inside.append(bool(low <= true.mean() <= high))
     return inside
+
+
+def measured(drive: Driven, members: Sequence[Poses], at: Sequence[int] = ()) -> list[bool]:
+    """Whether intervals of a set, or of a bank, hold; restarts are planted at scans."""
+    rng, seconds, found = np.random.default_rng(0), drive.seconds, list[Interval]()
+    motions, T, T_driven = np.stack([steps(T) for T in members], axis=1), np.eye(4), [np.eye(4)]
+    live = LiveEvidence(tuple(range(len(members))) if len(members) > 1 else (), LENGTH)
+    for i, scan in enumerate(drive.scans):
+        each = motions[i - 2] if i > 1 else np.tile(np.eye(4), (len(members), 1, 1))
+        T = mean_motion(each, np.ones(len(members)))
+        if i in at:  # it goes on by the motion before, and not quite
+            T = motions[i - 3, 0].copy()
+            T[:2, 3] += rng.normal(0.0, 0.15, 2)
+        if i > 1:
+            T_driven.append(rectify(T_driven[-1] @ T))
+        starts = int(np.sum(np.array(at) <= i))
+        live.observe(scan.stamp, scan, Motions(T, dict(enumerate(each)), starts))
+        if i and seconds[i] // 1.0 > seconds[i - 1] // 1.0:
+            live.measure()
+            if (error := live.own_error()) is not None:
+                found.append((seconds[i - 1], error.low, error.high))
+    T_driven.append(T_driven[-1] @ motions[-1, 0])
+    return held(drive, np.array(T_driven), found, OWN_SECONDS)
+
+
+def coverage(drive: Driven, found: Sequence[Told]) -> list[list[bool]]:
+    """Whether intervals hold: watched, of a single set, of a bank, and with restarts."""
+    own, restarts = drive.T_odom_sensor, np.arange(12.0, drive.seconds[-1], 11.0)
+    at = np.searchsorted(drive.seconds, restarts).tolist()
+    told = [(one.seconds, one.low, one.high) for one in found]
+    return [
+        held(drive, own, told, WINDOW),
+        measured(drive, [own]),
+        measured(drive, [own, *(odometry(drive.scans, other) for other in OTHERS)]),
+        measured(drive, [own], at),
+    ]
+
+
+def corridor(
+    half_length: float, reach: float, metres: float, rng: np.random.Generator
+) -> tuple[list[Scan], Poses]:
+    """Scans and poses along a smooth corridor, of a sensor that sees so far."""
+    looks, half = directions("hdl32e", 900).reshape(-1, 3), np.array([half_length, *AROUND])
+    T = np.tile(np.eye(4), (int(10.0 * metres / SPEED), 1, 1))
+    T[:, 0, 3] = np.linspace(-0.5, 0.5, len(T)) * metres
+    T[:, 1, 3] = 0.2 * np.sin(T[:, 0, 3] / 5.0)
+    scans = []
+    for i, position in enumerate(T[:, :3, 3]):
+        with np.errstate(divide="ignore"):
+            ranges = ((np.copysign(half, looks) - position) / looks).min(axis=1)
+        ranges += rng.normal(0.0, 0.015, len(ranges))
+        points = (looks * ranges[:, None])[ranges < reach].astype(np.float32)
+        scans.append(Scan(i * 10**8, points))
+    return scans, T
+
+
+def slid(T: Poses, at: int, share: float, rng: np.random.Generator) -> Poses:
+    """Poses of an odometry that tells, from one scan on, such a share of the way."""
+    moved = steps(T)
+    moved[:, :3, 3] += rng.normal(0.0, 0.003, (len(moved), 3)) * (1.0, 0.3, 0.3)
+    moved[at:, :3, 3] *= share
+    found = [np.eye(4)]
+    for step in moved:
+        found.append(found[-1] @ step)
+    return np.array(found)
+
+
+def slides(n: int, rng: np.random.Generator) -> tuple[list[float], list[str]]:
+    """Metres until slides are told; and the states along a corridor without ends."""
+    metres, states = [], []
+    for _ in range(n):
+        half_length = rng.uniform(28.0, 40.0)
+        scans, T = corridor(half_length, 100.0, 2.0 * half_length - 8.0, rng)
+        at = int(rng.uniform(0.4, 0.5) * len(T))
+        found = told(scans, slid(T, at, rng.uniform(0.8, 0.95), rng))
+        before = [one.error for one in found if 10.0 * one.seconds <= at]
+        left = [o.seconds for o in found if 10.0 * o.seconds > at and o.low > np.nanmax(before)]
+        metres.append(SPEED * (left[0] - 0.1 * at) if left else np.inf)
+        scans, T = corridor(500.0, rng.uniform(30.0, 100.0), 40.0, rng)
+        states += [one.state for one in told(scans, slid(T, 0, rng.uniform(0.9, 1.0), rng))]
+    return metres, states
 
 
 def main() -> None:
@@ -226,21 +342,30 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[211, 212])
     parser.add_argument("--planted", type=int, default=100)
     parser.add_argument("--drifts", type=int, default=60)
+    parser.add_argument("--slides", type=int, default=12)
+    parser.add_argument("--columns", type=int, help="of the simulated sensor")
+    parser.add_argument("--scenes", nargs="*", default=SCENES)
+    parser.add_argument("--states", action="store_true", help="only states, not intervals")
     given = parser.parse_args()
     rng, faults, drifts = np.random.default_rng(0), dict[str, list](), dict[str, list[float]]()
-    every = list(drives(given.folder, given.metres, given.seeds))
-    print(f"{'drive':12} {'s':>3}    good unknown doubtful lost  in vain    core  interval holds")
-    for drive in every:
+    every, sums = list[Driven](), np.zeros(5)
+    print(f"{'drive':12} {'s':>3}    good unknown doubtful lost  in vain    core  intervals hold")
+    for drive in drives(given):
+        if given.planted or given.drifts:
+            every.append(drive)
         begun = time.process_time()
         found = told(drive.scans, drive.T_odom_sensor)
         core = (time.process_time() - begun) / drive.seconds[-1]
         shares = [np.mean([one.state == state for one in found[3:]]) for state in STATES]
-        inside = held(drive, found)
+        inside = [] if given.states else coverage(drive, found)
         cells = "  ".join(f"{share:6.1%}" for share in shares)
-        holds = f"{np.mean(inside):6.1%} of {len(inside)}" if inside else "-"
-        vain = f"{in_vain(drive, found[3:]):6.1%}" if drive.T_ref_sensor is not None else "     -"
-        cells += f"  {vain}  {core:6.1%}"
+        holds = " ".join(f"{np.mean(one):4.0%} of {len(one)}" if one else "-" for one in inside)
+        vain = np.nan if drive.T_ref_sensor is None else in_vain(drive, found[3:])
+        sums += [drive.seconds[-1] * x for x in (1.0, *shares[1:], np.nan_to_num(vain))]
+        cells += f"  {vain:6.1%}  {core:6.1%}"
         print(f"{drive.name:12} {drive.seconds[-1]:3.0f}  {cells}  {holds}", flush=True)
+    rest = "  ".join(f"{share:6.2%}" for share in sums[1:] / max(sums[0], 1.0))
+    print(f"{sums[0] / 60.0:.1f} minutes: unknown, doubtful, lost, in vain {rest}", flush=True)
     for i in range(given.planted):
         kind, drive = list(FAULTS)[i % len(FAULTS)], every[i // len(FAULTS) % len(every)]
         if (found := planted(drive, kind, rng)) is not None:
@@ -258,6 +383,11 @@ def main() -> None:
         print(
             f"{kind:24} {soon:.0%} of {len(metres)} within 30 m; median {np.median(metres):.0f} m"
         )
+    if given.slides:
+        metres, states = slides(given.slides, rng)
+        print(f"slide along a corridor: metres {np.round(metres).tolist()}")
+        unknown = np.mean([state == "unknown" for state in states])
+        print(f"a corridor without ends is unknown for {unknown:.1%} of {len(states)} seconds")
 
 
 STATES = ("good", "unknown", "doubtful", "lost")

@@ -1,29 +1,33 @@
-"""Scans from a topic, as they come."""
+"""Scans and poses from topics, as they come."""
 
 import json
 import logging
 import math
 import threading
 import time
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import islice
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from rosbags.typesys.store import Typestore
 
-from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses, to_quaternions
+from adaptune.errors import AdaptuneError, warn_once
+from adaptune.geometry import Poses, to_pose, to_quaternions
 from adaptune.recording.clouds import CLOUDS, from_fields, header_of
 from adaptune.recording.config import ImuConfig
-from adaptune.recording.pose_messages import message_stamp
+from adaptune.recording.pose_messages import POSES, message_stamp
 from adaptune.recording.scan import Imu, Scan
 from adaptune.recording.timing import Timing
 from adaptune.ros.link import LinkError, RosLink
 from adaptune.selector import BACK
 from adaptune.space import Selection
+from adaptune.trajectory import Trajectory
 from online.real_time import Arrival
 
 SILENCE = 2.0
@@ -33,6 +37,13 @@ IMU_WAIT = 0.1
 _MAX_IMU = 20_000
 """Measurements that are kept."""
 IMU = "sensor_msgs/msg/Imu"
+ODOMETRY = "nav_msgs/msg/Odometry"
+SILENT = 10
+"""Scans of which most have no pose; then the log says so."""
+KEPT = 1000
+"""Poses of a node, and scans of a drive, that are kept."""
+_GAP = 1.0
+"""Seconds between poses over which a pose is interpolated."""
 
 _log = logging.getLogger(__name__)
 
@@ -195,6 +206,91 @@ class LiveScans:
         values = np.array([values for _, values in taken], np.float64).reshape(-1, 6)
         imu = self._settings.in_si(Imu(stamps, values[:, :3], values[:, 3:]))
         return replace(scan, imu=imu)
+
+
+class LivePoses:
+    """Poses of a LiDAR, of shape (4, 4), by an odometry on a `topic` (nav_msgs/Odometry).
+
+    `T_base_sensor` is the LiDAR's pose in the frame whose poses it publishes, `points` the topic of
+    the clouds that it hears. `late` ends what the log says of poses that "come later than".
+    """
+
+    def __init__(self, link: RosLink, topic: str, T_base_sensor: Poses, points: str, late: str):
+        self._link, self._topic, self._points, self._late = link, topic, points, late
+        self._T_base_sensor = T_base_sensor
+        self._news = threading.Condition()
+        self._poses: deque[tuple[int, Poses]] = deque(maxlen=KEPT)
+        self._silent: deque[bool] = deque(maxlen=SILENT)
+        self._missed: deque[int] = deque(maxlen=KEPT)  # stamps of scans without a pose in time
+        self._asked = self._step = 0  # stamp of the newest scan, and nanoseconds since the last one
+        self._warned = False
+        link.subscribe(topic, ODOMETRY, self._take)
+
+    def at(self, stamp: int, seconds: float) -> Poses:
+        """The pose at the stamp of a scan, which may come within so many seconds; else NaN."""
+        self._step, self._asked = stamp - self._asked, stamp
+        with self._news:
+            self._news.wait_for(lambda: self._poses and self._poses[-1][0] >= stamp, seconds)
+        T = self.near(stamp)
+        known = bool(np.isfinite(T).all())
+        self._silent.append(not known)
+        if not known:
+            self._missed.append(stamp)
+        self._tell_of_silence()
+        return T
+
+    def near(self, stamp: int) -> Poses:
+        """The pose at a stamp, straight between those that came; NaN if it is not known."""
+        with self._news:
+            after = bisect_left(self._poses, stamp, key=itemgetter(0))
+            near = list(islice(self._poses, max(after - 1, 0), after + 1))
+        if not near:
+            return np.full((4, 4), np.nan)
+        stamps, T = zip(*near, strict=True)
+        known = Trajectory(np.array(stamps, np.int64), np.array(T))
+        found: Poses = known.at(np.array([stamp], np.int64), _GAP)[0]
+        return found
+
+    def _take(self, message: Any) -> None:
+        for stamp, _, position, orientation in POSES[ODOMETRY](message):
+            values = (position.x, position.y, position.z)
+            quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
+            try:
+                T = to_pose((*values, *quaternion))
+            except ValueError:
+                continue  # no pose, which the health check sees
+            with self._news:
+                if self._poses and stamp < self._poses[-1][0] - BACK:
+                    self._poses.clear()
+                if not self._poses or stamp > self._poses[-1][0]:
+                    self._poses.append((stamp, T @ self._T_base_sensor))
+                self._news.notify()
+                self._tell_of_missed(stamp)
+
+    def _tell_of_silence(self) -> None:
+        n = sum(self._silent)
+        self._warned &= n > 0
+        # A node that loses clouds answers now and then.
+        if n < SILENT - 2 or len(self._silent) < SILENT or self._warned:
+            return
+        self._warned = True
+        try:
+            why = self._link.why_unheard(self._points)
+        except LinkError as error:
+            why = str(error)
+        usual = "is it the topic, and does its node run?"
+        _log.warning("%s: no pose for %d of %d scans; %s", self._topic, n, SILENT, why or usual)
+
+    def _tell_of_missed(self, stamp: int) -> None:
+        """Log, once, whether poses that were missed came late, by that of a stamp, or never."""
+        steps = np.diff([at for at, _ in self._poses][-SILENT:])
+        while self._missed and self._missed[0] <= stamp:
+            late = stamp - self._missed.popleft() < 0.5 * self._step
+            if not late and (len(steps) < 2 or steps[-1] <= 1.5 * np.median(steps)):
+                continue  # its habit
+            lost = "never come, and later ones do: is the node too slow, or does it lose clouds?"
+            why = f"come later than {self._late}" if late else lost
+            warn_once(f"{self._topic}: some poses {why}")
 
 
 # What adaptune publishes while a robot drives.

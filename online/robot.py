@@ -23,13 +23,13 @@ from adaptune.study.config import RealTimeConfig, RosConfig, StudyConfig
 from adaptune.study.driven import ModeError
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
-from online.live import LiveScans, RosMessages, Uncertainty, placed
+from online.live import KEPT, ODOMETRY, LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive
 from online.record import DriveLog
 from online.replay import Choice, ReplayRecord, Watch
 from online.selector_process import SelectorProcess
-from online.steered import KEPT, ODOMETRY, SteeredNode
+from online.steered import SteeredNode
 
 SELECTION_TOPIC = "adaptune/selection"
 _BEGIN = 6.0  # seconds in which a node that is not there is known to be missing

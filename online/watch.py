@@ -2,8 +2,8 @@
 
 import csv
 import math
-from collections.abc import Callable, Iterable
-from contextlib import closing
+import time
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -19,12 +19,14 @@ from adaptune.recording.timing import Timing
 from adaptune.ros.link import RosLink
 from adaptune.selector import Periods
 from adaptune.space import State
-from adaptune.study.config import SteerConfig
-from online.live import LiveScans, RosMessages
-from online.steered import SteeredNode
+from online.live import LivePoses, LiveScans, RosMessages
 
 WINDOW = 15.0
 """Seconds over which the error is told, or 30 m: a drift is to be seen soon."""
+PATIENCE = 1.0
+"""Seconds from a scan to its pose. Who steers nothing may wait, and slow odometries are in time."""
+WAITING = 20
+"""Scans that wait for their poses at most: those of a second of fast sensors."""
 DIAGNOSTICS = "/diagnostics"
 LEVELS: dict[State, int] = {"good": 0, "unknown": 1, "doubtful": 1, "lost": 2}
 """As diagnostic_msgs/DiagnosticStatus counts them: OK, WARN, ERROR."""
@@ -88,35 +90,25 @@ class Watch:
 
 
 def watch_topics(
-    link: RosLink,
-    points: str,
-    settings: SteerConfig,
-    length: float,
-    tell: Callable[[Told], None],
-    queue: int = 1,
-) -> None:
-    """Watch a node on a robot until Ctrl-C; where the clock goes back, all begins anew.
+    link: RosLink, points: str, odometry: str, T_base_sensor: Poses, length: float
+) -> Iterator[Told]:
+    """Watch a node on a robot; where the clock goes back, all begins anew.
 
-    What is told is published as diagnostics, too. Of scans that come meanwhile, so many wait.
+    `odometry` is the topic of its poses, `T_base_sensor` the LiDAR's in the frame that they are of.
+    What is told is published as diagnostics, too.
     """
     publish = link.advertise(DIAGNOSTICS, "diagnostic_msgs/msg/DiagnosticArray")
     messages = RosMessages(link.store, "odom")
-    with closing(SteeredNode(link, settings, points)) as node:
-        scans = LiveScans(link, points, Timing(), queue)
-        try:
-            while not scans.stopped:
-                watch = Watch(length)
-                for i, (scan, _, _) in enumerate(scans.arrivals()):
-                    if i:
-                        T_odom_sensor = node.register(scan).T_odom_sensor
-                    else:
-                        T_odom_sensor = np.eye(4)
-                        node.start(scan, T_odom_sensor)
-                    if (told := watch.see(scan, T_odom_sensor)) is not None:
-                        tell(told)
-                        publish(messages.diagnostics(told.stamp, settings.odometry, *_shown(told)))
-        except KeyboardInterrupt:
-            scans.stop()
+    late = f"{PATIENCE:g} s after their scans, and are not used: let less run on this machine"
+    poses = LivePoses(link, odometry, T_base_sensor, points, late)
+    scans = LiveScans(link, points, Timing(), WAITING)
+    while not scans.stopped:
+        watch = Watch(length)
+        for scan, came, _ in scans.arrivals():
+            T = poses.at(scan.stamp, max(0.0, came + PATIENCE - time.perf_counter()))
+            if (told := watch.see(scan, T)) is not None:
+                publish(messages.diagnostics(told.stamp, odometry, *_shown(told)))
+                yield told
 
 
 def _shown(told: Told) -> tuple[int, str, dict[str, str]]:
@@ -137,23 +129,19 @@ def write_told(path: Path, told: Iterable[Told]) -> None:
 
 
 def in_words(told: list[Told]) -> list[str]:
-    """Whether to believe the odometry, in at most four sentences."""
+    """Whether to believe the odometry, in at most three sentences."""
     if len(told) < 2:
         return ["Too short to tell: give two seconds of scans at least."]
     spans = [(one, after.seconds - one.seconds) for one, after in pairwise(told)]
     total = told[-1].seconds - told[0].seconds
-    known: dict[State, float] = {}
-    for one, seconds in spans:
-        known[one.state] = known.get(one.state, 0.0) + seconds
-    said = []
     begins: dict[State, str] = {"lost": "Do not rely on it", "doubtful": "Look at it"}
+    said = []
     for state, first in begins.items():
-        if seconds := known.get(state, 0.0):
-            begin = next(one for one, _ in spans if one.state == state)
-            what = f"{first}: it is {state} for {seconds:.0f} s of {total:.0f}"
-            said.append(f"{what}, first at {begin.seconds:.1f} s: {begin.why}.")
+        if within := [(one, seconds) for one, seconds in spans if one.state == state]:
+            what = f"{first}: it is {state} for {sum(s for _, s in within):.0f} s of {total:.0f}"
+            said.append(f"{what}, first at {within[0][0].seconds:.1f} s: {within[0][0].why}.")
     if not said:
-        unknown = known.get("unknown", 0.0)
+        unknown = sum(seconds for one, seconds in spans if one.state == "unknown")
         said = [f"Nothing speaks against it in {total:.0f} s, {unknown:.0f} of them unknown."]
     errors = [one.error for one in told if math.isfinite(one.error)]
     if errors:

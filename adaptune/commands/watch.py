@@ -4,7 +4,7 @@ import logging
 import math
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,14 +54,19 @@ def watch(
         raise AdaptuneError("name a bag, or listen on a robot with --ros or --ros2")
     if not 0.0 < sub_trajectory < math.inf:
         raise AdaptuneError("--sub-trajectory: give metres, more than 0")
+    if bag is None and points is None:
+        raise AdaptuneError("--points: name the topic of the scans on the robot")
     try:
-        with progress() as show:
+        with progress() as show, suppress(KeyboardInterrupt):
             if bag is not None:
-                told += _along(bag, odometry, points, sub_trajectory, by, show)
-            elif points is None:
-                raise AdaptuneError("--points: name the topic of the scans on the robot")
+                every = _along(bag, odometry, points, sub_trajectory, by, show)
             else:
-                _on_robot(odometry, points, sub_trajectory, by, show, told, ros2=ros2)
+                every = _on_robot(odometry, points or "", sub_trajectory, by, show, ros2=ros2)
+            for one in every:
+                if told and told[-1].state != one.state:
+                    what = f"{odometry} is {one.state} at {one.seconds:.1f} s"
+                    log.warning("%s%s", what, f": {one.why}" if one.why else "")
+                told.append(one)
     finally:  # what was told is kept, whatever ends it
         if told:
             write_told(out, told)
@@ -89,39 +94,24 @@ def _along(
 
 
 def _on_robot(
-    odometry: str,
-    points: str,
-    length: float,
-    by: "Convention",
-    show: "Progress",
-    told: list["Told"],
-    *,
-    ros2: bool,
-) -> None:
-    from pydantic import ValidationError
+    odometry: str, points: str, length: float, by: "Convention", show: "Progress", *, ros2: bool
+) -> Iterator["Told"]:
+    from pydantic import TypeAdapter, ValidationError
 
     from adaptune.machine import pin
     from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
     from adaptune.strict import in_one_line
-    from adaptune.study.config import SteerConfig
+    from adaptune.study.config import RosName
     from online.watch import watch_topics
 
-    def tell(one: "Told") -> None:
-        if told and told[-1].state != one.state:
-            why = f": {one.why}" if one.why else ""
-            log.warning("%s is %s at %.1f s%s", odometry, one.state, one.seconds, why)
-        told.append(one)
-        error = f", error {one.error:.2f} %" if math.isfinite(one.error) else ""
-        show("watching", len(told), len(told), one.state + error)
-
-    place = tuple(map(tuple, by.T_body_sensor.tolist()))
     try:
-        settings = SteerConfig(node=odometry, odometry=odometry, extrinsic=place)
+        TypeAdapter(RosName).validate_python(odometry)
     except ValidationError as error:
         raise AdaptuneError(f"--odometry {odometry}: {in_one_line(error)}") from error
-    with ExitStack() as stack:
-        link = stack.enter_context(closing(local_ros2() if ros2 else local_ros1()))
-        stack.enter_context(pin(os.getpid(), alone=True))
+    with closing(local_ros2() if ros2 else local_ros1()) as link, pin(os.getpid(), alone=True):
         log.info("watch, %s: Ctrl-C ends it", odometry)
-        watch_topics(link, points, settings, length, tell)
+        for n, told in enumerate(watch_topics(link, points, odometry, by.T_body_sensor, length), 1):
+            known = f", error {told.error:.2f} %" if math.isfinite(told.error) else ""
+            show("watching", n, n, told.state + known)
+            yield told

@@ -105,6 +105,7 @@ class LiveEvidence:
 
     def _begin(self) -> None:
         self._rejected = 0  # hops in a row, which a restart does not excuse
+        self._blind = 0  # hops in a row that do not tell the way, as in a tunnel
         self._forget_errors()
         self._own = OwnErrors(self._length, seconds=self._seconds)
         self._anchors: deque[_Anchor] = deque()
@@ -216,9 +217,12 @@ class LiveEvidence:
         if end is not self._anchors[-1]:
             self._anchors.append(end)
         measured = self._register(starts, end)
-        # On an open plain only height can be told; that is no loss of track.
-        if measured is not None and np.trace(measured.hop.projection) < _MIN_DIRECTIONS:
-            return None
+        if measured is not None:
+            shows = measured.hop.shows(measured.hop.T_start_end[:3, 3])
+            self._blind = 0 if shows else self._blind + 1
+            # On an open plain only height can be told; that is no loss of track.
+            if np.trace(measured.hop.projection) < _MIN_DIRECTIONS:
+                return None
         if measured is None or not self._is_confirmed(measured):
             self._rejected += starts[-1].stamp >= self._restarted
             return None
@@ -299,7 +303,7 @@ class LiveEvidence:
             with np.errstate(invalid="ignore"):
                 wrong = np.linalg.norm(errors, axis=1) > LOST
             self._wrong = np.where(wrong, self._wrong + 1, 0)
-        if known[0]:
+        if known[0] and not self._blind:
             self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
         self._rejected = 0
 
@@ -328,7 +332,10 @@ class LiveEvidence:
         return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
 
     def own_error(self) -> OwnError | None:
-        """The odometry's, or the bank's, own error over the last metres; None without any hop."""
+        """The odometry's, or the bank's, own error over the last metres; None if nothing tells."""
+        # Where hops are rejected, or blind, the last chains are of before.
+        if max(self._rejected, self._blind) >= HOPS_TO_BE_LOST:
+            return None
         return self._own.estimate()
 
     def _own_error_with(self, predicted: float, familiarity: float) -> OwnError | None:
@@ -350,9 +357,6 @@ class LiveEvidence:
         state, why = self.health
         restart = self._told_to_restart()
         selection = selection._replace(state=state, why=why, restart=restart)
-        # Where registrations are rejected, the last chains are of before.
-        if self._rejected >= HOPS_TO_BE_LOST:
-            return selection
         error = self._own_error_with(selection.predicted_error, selection.familiarity)
         if error is None:
             return selection

@@ -19,8 +19,10 @@ NOISE = 0.02  # metres by which a registration is wrong, about
 NEW_GUESS = 0.3  # metres between guesses that are worth a registration each
 MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
-DEGENERATE = 0.002
-"""A direction is unknown if its information is less than this share of the best direction's."""
+DEGENERATE = 0.01
+"""A direction is unknown if its information is less than this share of the best direction's. It is
+at most 0.006 along a smooth corridor without ends, and at least 0.02 on open ground."""
+SHOWN = 0.7  # least share of a way that a registration has to tell
 _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
 _MIN_RANGE = 1.0
@@ -28,9 +30,9 @@ _MIN_POINTS = 100  # points; small_gicp crashes on an empty target, and three po
 REACHES, OFFLINE_REACHES = (1.0,), (2.0, 0.5)
 """Metres of the greatest distance of correspondences, one registration after the other; the second
 where there is time for two."""
-CLOUD, OFFLINE_CLOUD = (0.5, 10), (0.25, 20)
-"""Metres between points of a cloud, and neighbours that give a point's covariance; the second where
-there is time for it."""
+CLOUD, OFFLINE_CLOUD = (0.5, 10, 4000), (0.25, 20, 10**9)
+"""Metres between points of a cloud, neighbours that give a point's covariance, and points above
+which it becomes coarser, as along wide roads; the second where there is time for it."""
 _ITERATIONS = 20
 _OF_A_PLANE = 0.5
 """Information that small_gicp ascribes to a pair of points along their plane; there is none."""
@@ -43,6 +45,10 @@ class Hop(NamedTuple):
     # Of shape (3, 3): keeps of a vector in the start's frame what the registration can tell.
     projection: NDArray[np.float64]
     inliers: float = 1.0  # share of points near a point of the other scan
+
+    def shows(self, way: NDArray[np.float64]) -> bool:
+        """Whether it tells how far the sensor moved along a way of shape (3,); no tunnel does."""
+        return float(np.linalg.norm(self.projection @ way)) > SHOWN * float(np.linalg.norm(way))
 
 
 class Hops(NamedTuple):
@@ -80,7 +86,7 @@ class HopCloud:
         scan: Scan,
         T_previous_current: Poses,
         seconds: float,
-        fineness: tuple[float, int] = CLOUD,
+        fineness: tuple[float, int, int] = CLOUD,
     ):
         self._scan: Scan | None = scan
         self._fineness = fineness
@@ -105,7 +111,7 @@ class HopCloud:
 
 
 def _prepare(
-    scan: Scan, T_previous_current: Poses, seconds: float, fineness: tuple[float, int]
+    scan: Scan, T_previous_current: Poses, seconds: float, fineness: tuple[float, int, int]
 ) -> Any:
     import small_gicp  # takes long to import
 
@@ -114,7 +120,9 @@ def _prepare(
     points = scan.points[squared_ranges(scan.points) >= _MIN_RANGE**2].astype(np.float64)
     if len(points) < _MIN_POINTS:
         return None
-    cell, neighbours = fineness
+    cell, neighbours, most = fineness
+    size = small_gicp.voxelgrid_sampling(points, cell).size() if len(points) > most else 0
+    cell *= max(1.0, size / most) ** 0.5
     cloud, tree = small_gicp.preprocess_points(
         points, downsampling_resolution=cell, num_neighbors=neighbours, num_threads=1
     )
@@ -127,6 +135,7 @@ def register(
     guesses: Iterable[Poses],
     min_inliers: float = MIN_INLIERS,
     reaches: Sequence[float] = REACHES,
+    iterations: int = _ITERATIONS,
 ) -> Hop | None:
     """Register two scans; the first guess that leads to a sound registration wins.
 
@@ -144,7 +153,7 @@ def register(
                 *(target, source, tree),
                 init_T_target_source=T_start_end,
                 max_correspondence_distance=reach,
-                max_iterations=_ITERATIONS,
+                max_iterations=iterations,
                 num_threads=1,
             )
             T_start_end = result.T_target_source  # noqa: PLW2901

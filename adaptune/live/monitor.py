@@ -6,7 +6,6 @@ hops say (`adaptune.live.evidence`), count beside it.
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +38,7 @@ STARTS, STARTS_SECONDS = 3, 10.0
 LONGEST = 2.0
 """Seconds between scans that are compared, or twice their interval."""
 HOPS_TO_BE_LOST = 2
-"""Hops in a row that must disagree before it counts as lost, or be rejected to be in doubt."""
+"""Hops in a row that must disagree before it counts as lost, or be rejected to be unknown."""
 NO_POSE = 1.0
 """Seconds without a pose after which it is lost."""
 
@@ -125,50 +124,52 @@ class HealthMonitor:
             self._steps.append(_Step(seconds, False))
             return
         best = max(found, key=lambda hop: hop.inliers)
-        # Where a place repeats itself, another motion looks as well.
-        best = found[0] if best.inliers < found[0].inliers + BETTER else best
+        # Where a place repeats itself, another motion looks as well; one that is known counts more.
+        tells = np.trace(best.projection) > np.trace(found[0].projection) + 0.5
+        best = best if tells or best.inliers >= found[0].inliers + BETTER else found[0]
         self._measured = best.T_start_end, took
-        self._steps.append(_Step(seconds, True, _contradicts(T, best, took), _is_known(T, best)))
+        off = _contradicts(T, best, took)
+        # Along a place that shows nothing, scans look as if the sensor stood still.
+        if off and np.linalg.norm(best.T_start_end[:3, 3]) < np.linalg.norm(T[:3, 3]):
+            there = register(begin[1], cloud, [T], iterations=1)
+            if there is not None:
+                best = best._replace(projection=there.projection @ best.projection)
+                off = _contradicts(T, best, took)
+        self._steps.append(_Step(seconds, True, off, _is_known(T, best)))
 
     def health(self, wrong: int = 0, rejected: int = 0) -> Health:
         """The state now; so many hops in a row were `wrong` by much, or `rejected`."""
-        held = max(HELD, 2.0 * self._period)
+        now, held = self._now, max(HELD, 2.0 * self._period)
         # Where nothing is in doubt, seconds are compared seldom.
-        until = self._steps[-1].seconds if self._steps else self._now
+        until = self._steps[-1].seconds if self._steps else now
         steps = [step for step in self._steps if until - step.seconds <= 2.0 * held]
         last = [step for step in steps if until - step.seconds <= held]
-        if why := next(self._losses(steps, wrong), ""):
-            return Health("lost", why)
-        if why := next(self._doubts(last, held, wrong, rejected), ""):
-            return Health("doubtful", why)
-        if not any(step.known for step in last):
-            return Health("unknown", "the scans do not tell its motion" if self._steps else "")
-        return Health("good")
-
-    def _losses(self, steps: Sequence[_Step], wrong: int) -> Iterator[str]:
-        if (seconds := self._now - self._posed) > max(NO_POSE, 2.0 * self._period):
-            yield f"no pose for {seconds:.1f} s"
-        if sum(self._now - at <= STARTS_SECONDS for at in self._starts) >= STARTS:
-            yield f"{STARTS} impossible motions or more within {STARTS_SECONDS:g} s"
         off = [step.off for step in steps if step.accepted][-2:]
-        if len(off) == 2 and all(off):
-            yield off[-1]
-        if wrong >= HOPS_TO_BE_LOST:
-            yield "registrations over 10 m contradict its motion"
-
-    def _doubts(
-        self, last: Sequence[_Step], held: float, wrong: int, rejected: int
-    ) -> Iterator[str]:
-        if self._starts and self._now - self._starts[-1] <= held:
-            yield "its motion was impossible"
-        yield from (step.off for step in reversed(last) if step.off)
-        if self._odd is not None:
-            yield self._odd[1]
-        if wrong or rejected >= HOPS_TO_BE_LOST:
-            yield "registrations over 10 m do not confirm its motion"
+        doubts = [step.off for step in reversed(last) if step.off]
+        known, silent = any(step.known for step in last), now - self._posed
+        unconfirmed = rejected >= HOPS_TO_BE_LOST
+        hops = "registrations over 10 m do not confirm its motion"
+        often = f"{STARTS} impossible motions or more within {STARTS_SECONDS:g} s"
+        restarts = [now - at for at in self._starts]
         accepted = [step.accepted for step in self._steps]
-        if len(accepted) > LEAST_STEPS and np.mean(accepted) >= USUALLY and not accepted[-1]:
-            yield "scans of a second cannot be registered any more"
+        usual = len(accepted) > LEAST_STEPS and float(np.mean(accepted)) >= USUALLY
+        # The worst first.
+        found: list[tuple[bool, State, str]] = [
+            (silent > max(NO_POSE, 2.0 * self._period), "lost", f"no pose for {silent:.1f} s"),
+            (sum(ago <= STARTS_SECONDS for ago in restarts) >= STARTS, "lost", often),
+            (len(off) == 2 and all(off), "lost", "".join(off[-1:])),
+            (wrong >= HOPS_TO_BE_LOST, "lost", "registrations over 10 m contradict its motion"),
+            (any(ago <= held for ago in restarts), "doubtful", "its motion was impossible"),
+            (bool(doubts), "doubtful", "".join(doubts[:1])),
+            (self._odd is not None, "doubtful", self._odd[1] if self._odd else ""),
+            (wrong > 0 or (unconfirmed and not known), "doubtful", hops),
+            (usual and not accepted[-1], "doubtful", "scans of a second cannot be registered"),
+            (not known, "unknown", "the scans do not tell its motion" if self._steps else ""),
+            # From a cave into the open, scans of each second agree, and those 10 m apart do not.
+            (unconfirmed, "unknown", hops),
+            (True, "good", ""),
+        ]
+        return next(Health(state, why) for so, state, why in found if so)
 
 
 def _contradicts(T_odom: Poses, hop: Hop, took: float) -> str:
@@ -187,7 +188,6 @@ def _contradicts(T_odom: Poses, hop: Hop, took: float) -> str:
 def _is_known(T_odom: Poses, hop: Hop) -> bool:
     """Whether a registration tells how far the sensor moved: in a corridor it may not."""
     step = T_odom[:3, 3]
-    way = float(np.linalg.norm(step))
-    if way < OFF:
+    if float(np.linalg.norm(step)) < OFF:
         return float(np.trace(hop.projection)) > 2.5
-    return float(np.linalg.norm(hop.projection @ step)) > 0.7 * way
+    return hop.shows(step)

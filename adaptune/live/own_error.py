@@ -6,6 +6,7 @@ reach over a sub-trajectory, where the odometry's errors are several times the c
 """
 
 from collections import deque
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,8 @@ scaled to e times the metres of its chains."""
 SCATTER = 0.6
 """Standard deviation of the logarithm of the error from one sub-trajectory to the next."""
 HOP_ERROR = 0.05
-"""Metres by which a hop itself is wrong where registrations are worst, as among plants."""
+"""Metres by which a hop itself may be wrong at most, and where no others tell."""
+FEWEST_PAIRS = 4  # of hops that overlap by half, from which on they tell how wrong they are
 HIDDEN = 0.0075  # metres of an odometry's error that a hop may have, too, and so hide
 PREDICTED_WINDOWS = 2.0  # how many chains that do not overlap a prediction from training counts as
 DEVIATION, COMMON = 0.64, 0.1
@@ -66,6 +68,7 @@ class _Chain(NamedTuple):
     seconds: float
     error: float  # metres
     hops: int  # how many
+    covered: float  # metres that they cover
 
 
 class OwnErrors:
@@ -107,18 +110,18 @@ class OwnErrors:
         """The mean error over the last chains; None without any."""
         if not self._chains:
             return None
-        (start, end, error, hops), times = self._long_chains()
+        (start, end, error, hops, covered), times = self._long_chains()
         reach = end - start
         mean = times**GROWTH * float((100.0 * error / reach).mean())
         n = windows(start, end)
-        # What no chain covers may be another sort of place.
-        missed = max(0.0, 1.0 - n * float(reach.mean()) / float(end.max() - start.min()))
+        # What no hop covers may be another sort of place.
+        missed = max(0.0, 1.0 - n * float(covered.mean()) / float(end.max() - start.min()))
         of_one = LOG_DEVIATION**2 + SCATTER**2 * missed
         deviation = np.sqrt(of_one / n + (LOG_DEVIATION * np.log(times)) ** 2)
         factor = float(np.exp(1.96 * deviation))
         # Some of it, or all, may be what the hops are wrong by.
         of_a_metre = times**GROWTH * float((100.0 * np.sqrt(hops) / reach).mean())
-        low = float(np.sqrt(max(0.0, mean**2 - (HOP_ERROR * of_a_metre) ** 2))) / factor
+        low = float(np.sqrt(max(0.0, mean**2 - (self._hop_error() * of_a_metre) ** 2))) / factor
         return OwnError(mean, low, float(np.hypot(mean * factor, HIDDEN * of_a_metre)))
 
     def estimate_with(self, predicted: float, share: float) -> OwnError | None:
@@ -129,7 +132,7 @@ class OwnErrors:
         """
         if not self._chains:
             return None
-        (start, end, error, _), times = self._long_chains()
+        (start, end, error, *_), times = self._long_chains()
         measured = np.log(np.maximum(LEAST, times**GROWTH * 100.0 * error / (end - start))).mean()
         n, prior = windows(start, end), PREDICTED_WINDOWS * share
         mean = float(np.exp((n * measured + prior * np.log(max(LEAST, predicted))) / (n + prior)))
@@ -137,15 +140,28 @@ class OwnErrors:
         factor = float(np.exp(1.96 * np.sqrt(variance + (LOG_DEVIATION * np.log(times)) ** 2)))
         return OwnError(mean, mean / factor, mean * factor)
 
+    def _hop_error(self) -> float:
+        """Metres by which hops are wrong: where two overlap, the odometry errs about alike."""
+        apart = [
+            _wrong(link) - _wrong(before)
+            for before, link in pairwise(self._links)
+            if before.end - link.start > 0.5 * max(before.end - before.start, link.end - link.start)
+        ]
+        if self._whole or len(apart) < FEWEST_PAIRS:
+            return HOP_ERROR
+        return float(
+            np.clip(np.sqrt(0.5 * (np.array(apart) ** 2).sum() / len(apart)), HIDDEN, HOP_ERROR)
+        )
+
     def _long_chains(self) -> tuple[NDArray[np.float64], float]:
-        """Starts, ends, errors and hops of the long chains, and the length in theirs."""
-        start, end, _, error, hops = np.array(self._chains).T
+        """Starts, ends, errors, hops and covers of long chains, and the length in theirs."""
+        start, end, _, *others = np.array(self._chains).T
         reach = end - start
         # Of a whole recording, the last chain may be a short one.
         usual = float(reach.max() if self._whole else reach[-1])
         long = reach >= MIN_REACH * min(self._length, usual)
         times = max(1.0, self._length / float(reach[long].mean()))
-        return np.stack([start, end, error, hops])[:, long], times
+        return np.stack([start, end, *others])[:, long], times
 
 
 def _chain(links: deque[Link], length: float) -> _Chain:
@@ -167,7 +183,13 @@ def _chain(links: deque[Link], length: float) -> _Chain:
     error = float(np.linalg.norm(T_odom[:3, 3] - T[:3, 3]))
     # Between the hops it errs, too, and not in the same direction.
     error *= float(np.sqrt((newest.end - first.start) / covered))
-    return _Chain(first.start, newest.end, newest.seconds, error, n)
+    return _Chain(first.start, newest.end, newest.seconds, error, n, covered)
+
+
+def _wrong(link: Link) -> NDArray[np.float64]:
+    """What the odometry's motion differs by from the hop's, in metres, of shape (3,)."""
+    T_odom = invert(link.T_odom_start) @ link.T_odom_end
+    return np.asarray(T_odom[:3, 3] - _completed(link)[:3, 3])
 
 
 def _completed(link: Link) -> Poses:

@@ -269,12 +269,11 @@ def test_a_node_that_is_silent_gives_no_pose_and_goes_on(link, node):
 
 
 LATE = (
-    "/odom: some poses of /node come later than online.ros.steer.patience (0.01 s) allows: raise "
-    "it, or let less run on this machine"
+    "/odom: some poses come later than online.ros.steer.patience (0.01 s) allows: raise it, or "
+    "let less run on this machine"
 )
 LOST = (
-    "/odom: some poses of /node never come, and later ones do: is the node too slow, or does it "
-    "lose clouds?"
+    "/odom: some poses never come, and later ones do: is the node too slow, or does it lose clouds?"
 )
 
 
@@ -319,7 +318,7 @@ def test_a_topic_without_poses_is_named_once(node, caplog):
     for i in range(1, 30):
         odometry.register(scan(i * TENTH))
     assert caplog.messages == [
-        "/odom: no pose of /node for 10 of 10 scans; is it the topic, and does the node run?"
+        "/odom: no pose for 10 of 10 scans; is it the topic, and does its node run?"
     ]
 
 
@@ -330,7 +329,7 @@ def test_a_node_that_answers_now_and_then_may_not_hear(link, node, caplog):
         if i % 8 == 0:
             play(link, i * TENTH)
         odometry.register(scan(i * TENTH))
-    assert caplog.messages == ["/odom: no pose of /node for 9 of 10 scans; /node runs on Fast DDS"]
+    assert caplog.messages == ["/odom: no pose for 9 of 10 scans; /node runs on Fast DDS"]
     # Half of them may be its habit.
     caplog.clear()
     for i in range(60, 90):

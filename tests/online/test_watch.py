@@ -1,4 +1,6 @@
 import csv
+import threading
+from itertools import islice
 
 import drives
 import local_link
@@ -8,8 +10,10 @@ from rooms import moved, scan_at, street
 from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
+from adaptune.errors import warn_once
 from adaptune.recording.scan import Scan
-from adaptune.study.config import SteerConfig
+from adaptune.ros.link import LinkError
+from online import watch
 from online.watch import Watch, in_words, watch_topics
 
 STEP = 0.15
@@ -86,6 +90,21 @@ def test_what_was_told_is_kept_where_the_robot_goes_away(bag, monkeypatch):
     assert list(csv.DictReader((bag.parent / "watch.csv").open()))
 
 
+def test_ctrl_c_ends_it(bag, monkeypatch):
+    def watched_until_interrupted(*_):
+        yield from watched(n=41)
+        raise KeyboardInterrupt
+
+    link = local_link.LocalLink()
+    monkeypatch.setattr("adaptune.ros.ros2.local_ros2", lambda: link)
+    monkeypatch.setattr(watch, "watch_topics", watched_until_interrupted)
+    words = ["watch", "--ros2", "--points", "/points", "--odometry", "/odom"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert "Nothing speaks against it in 4 s" in result.output
+    assert len(list(csv.DictReader((bag.parent / "watch.csv").open()))) == 5
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -102,8 +121,10 @@ def test_what_is_wrong_is_told(bag, words, says):  # noqa: ARG001
     assert says in str(result.exception) + result.output
 
 
-def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics():
-    played, told = drives.scans(4, 30), []
+def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics(monkeypatch):
+    monkeypatch.setattr(watch, "PATIENCE", 60.0)
+    monkeypatch.setattr(watch, "WAITING", 0)  # all may wait
+    played = drives.scans(4, 30)
 
     def messages():
         for i, (stamp, points, T) in enumerate(played):
@@ -111,16 +132,36 @@ def test_a_node_on_a_robot_is_watched_and_told_as_diagnostics():
             yield "/odom", local_link.odometry(stamp, still if i > 18 else T)
             yield "/points", local_link.cloud(stamp, points)
 
-    def tell(one):
-        told.append(one)
-        if len(told) == 3:
-            raise KeyboardInterrupt
-
     link = local_link.LocalLink(messages())
-    settings = SteerConfig(node="/odom", odometry="/odom", patience=60.0)
-    watch_topics(link, "/points", settings, 5.0, tell, queue=0)
+    told = list(islice(watch_topics(link, "/points", "/odom", np.eye(4), 5.0), 3))
     assert [one.state for one in told[:2]] == ["unknown", "unknown"]
     first = link.published["/diagnostics"][0].status[0]
     assert (first.level, first.name) == (1, "adaptune: /odom")
     assert {pair.key for pair in first.values} >= {"state", "restarts"}
     assert not link.holds  # it sets no parameter
+
+
+def test_poses_that_come_late_are_told_in_words_of_a_listener(monkeypatch, caplog):
+    warn_once.cache_clear()
+    monkeypatch.setattr(watch, "PATIENCE", 0.0)
+    monkeypatch.setattr(watch, "WAITING", 0)
+    monkeypatch.setattr("online.live.SILENCE", 0.1)
+    played = drives.scans(4, 30)
+
+    def messages():
+        for stamp, points, _ in played:
+            yield "/points", local_link.cloud(stamp, points)
+        finished.wait()
+        for stamp, _, T in played:
+            yield "/odom", local_link.odometry(stamp, T)
+        link.alive = False
+
+    finished, link = threading.Event(), local_link.LocalLink(messages())
+    every = watch_topics(link, "/points", "/odom", np.eye(4), 5.0)
+    *_, last = islice(every, 3)
+    finished.set()
+    with pytest.raises(LinkError):
+        list(every)
+    assert last.state == "lost"
+    assert "come later than 0 s after their scans, and are not used" in caplog.text
+    assert "patience" not in caplog.text

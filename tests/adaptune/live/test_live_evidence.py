@@ -358,6 +358,7 @@ def test_what_a_hop_cannot_tell_counts_for_nothing(exactly):
     live = LiveEvidence((0, 1))
     drive(live, 60, bank(1.0, 1.5))
     np.testing.assert_allclose(live.squares().products, 0.0, atol=1e-12)
+    assert live.own_error() is None
     assert live.estimated(Selection(0, {})).restart == frozenset()
 
 

@@ -5,6 +5,7 @@ import pytest
 from rooms import moved, scan_at, street, tunnel
 
 from adaptune.live.evidence import LiveEvidence
+from adaptune.live.monitor import HealthMonitor
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 
@@ -90,6 +91,12 @@ def test_a_tunnel_tells_nothing():
     assert {one.state for one in found[2:]} == {"unknown"}
 
 
+def test_a_tunnel_that_looks_alike_everywhere_tells_nothing():
+    """Its scans are those of a sensor that stands, and the odometry is not to blame."""
+    found = states(right, see=lambda i: scan_at(tunnel(), 0.0, seed=i))
+    assert {one.state for one in found[2:]} == {"unknown"}
+
+
 def test_no_pose_and_many_restarts_are_loss():
     gone = states(lambda i: np.full((4, 4), np.nan) if i > 40 else right(i))
     assert gone[6].why.startswith("no pose for")
@@ -113,3 +120,15 @@ def test_where_nothing_is_in_doubt_one_second_of_five_is_compared():
             found.append(live.health.state)
     assert len(checked) < 16
     assert set(found[3:]) == {"good"}
+
+
+def test_rejected_hops_are_doubt_only_where_seconds_do_not_agree():
+    live = LiveEvidence()
+    for i in range(60):
+        live.observe(i * 10**8, scan(i), Motions(moved(STEP), {}))
+        if i % RATE == 0:
+            live.check()
+    assert live._monitor.health(rejected=1).state == "good"
+    assert live._monitor.health(rejected=2).state == "unknown"
+    assert live._monitor.health(wrong=1).state == "doubtful"
+    assert HealthMonitor().health(rejected=2).state == "doubtful"

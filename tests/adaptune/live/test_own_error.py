@@ -118,10 +118,30 @@ def test_an_error_that_may_be_the_hops_own_may_be_none():
     """A chain of two hops is less wrong for its length than a single hop."""
     for length, of_hops in ((10.0, 0.5), (20.0, 0.5 / np.sqrt(2.0))):
         for times in (0.9, 1.1):
-            share = 1.0 + times * of_hops / 100.0
-            _, found = along(length, lambda metres, share=share: moved(share * metres))
-            assert found[-1].mean == pytest.approx(times * of_hops)
-            assert (found[-1].low > 0.0) == (times > 1.0)
+            share, own = 1.0 + times * of_hops / 100.0, OwnErrors(length)
+            for start in range(0, 100, 10):
+                own.add(
+                    link(start, start + 10.0, lambda metres, share=share: moved(share * metres))
+                )
+            found = own.estimate()
+            assert found.mean == pytest.approx(times * of_hops)
+            assert (found.low > 0.0) == (times > 1.0)
+
+
+def test_hops_that_overlap_tell_how_wrong_they_are():
+    """Those that agree with each other leave the error to the odometry."""
+    shares = []
+    for noise in (0.0, 0.01, 0.03, 1.0):
+        own = OwnErrors(10.0)
+        for start in range(20):
+            one = link(start, start + 10.0, lambda metres: moved(1.004 * metres))
+            aside = moved(y=noise if start % 2 else -noise)
+            own.add(one._replace(hop=one.hop._replace(T_start_end=one.hop.T_start_end @ aside)))
+        found = own.estimate()
+        shares.append(found.low / found.mean)
+    sure, rather, hardly, wild = shares
+    assert sure > rather > hardly + 0.1
+    assert sure == pytest.approx(wild, abs=0.05)  # so much is nobody's but the odometry's
 
 
 def test_what_is_long_ago_is_forgotten():
