@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
-from adaptune.files import DAMAGED_NPZ, replacing
+from adaptune.files import DAMAGED_NPZ, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import FAILURE, cap
 from adaptune.recording.cache import status_key
-from adaptune.space import ParameterSet
+from adaptune.space import ParameterSet, ParameterSets
 from adaptune.strict import ConfigurationError
 
 # In `Trial.usage`; the last one in seconds, where the first scan has no pose.
@@ -129,6 +129,7 @@ class Summary:
     unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
     failure: str = ""  # see `Trial`
     source: str = ""  # see `Trial`
+    limits: str = ""  # digest of those of its processes
 
     @property
     def cost(self) -> float:
@@ -162,6 +163,7 @@ def summarise(trial: Trial) -> Summary:
 class Sources(NamedTuple):
     """What the trials of a study depend on."""
 
+    names: Sequence[str]  # of the sequences that are driven
     shared: manifest.Inputs  # on every sequence
     of_sequence: Callable[[str], manifest.Inputs]
     # The files that digests in these are of, see `manifest.changes`.
@@ -176,6 +178,11 @@ class Sources(NamedTuple):
         return {file: status_key(file) for of in self.files(sequence).values() for file in of}
 
 
+def _of_poses(inputs: manifest.Inputs) -> dict[str, Any]:
+    """What poses depend on: descriptors are of scans, and limits end a drive as a fault."""
+    return {key: value for key, value in inputs.items() if key not in ("descriptors", "limits")}
+
+
 _ARRAYS, _SINGLE = ("T_odom_sensor", "restarted", "registered"), ("errors", "seconds")
 _PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "failure", "source")
 """Parts of a trial that are stored as they are, in single precision, and as JSON."""
@@ -184,120 +191,94 @@ _SUMMARY = "summary"
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
 
+CURRENT = "current.json"
+"""By sequence, the name of the folder that was used last."""
+
+
 class Archive:
     """The trials of a study, a file for each trial and sequence.
 
-    Its folder holds ``<sequence>/frames.npz`` and ``<sequence>/<number>.npz``. All methods raise
-    an ArchiveError where a file that they need is missing or damaged.
+    It holds ``<sequence>-<digest>/frames.npz`` and ``<sequence>-<digest>/<number>.npz``. The digest
+    is of all that poses depend on: what differs is in another folder, and what is there counts
+    again. All methods raise an ArchiveError where a file that they need is missing or damaged.
 
     Parameters
     ----------
     folder
         Need not exist.
     sources
-        What trials depend on; recorded beside the first of a sequence that is written.
+        What trials depend on; recorded beside the first of a sequence that is written. Without, it
+        is what was used last.
     """
 
     def __init__(self, folder: Path, sources: Sources | None = None):
         self.folder = folder
         self._sources = sources
+        self._last: dict[str, str] = {}
+        with suppress(OSError, ValueError):
+            self._last = dict(json.loads((folder / CURRENT).read_text()))
+        self._folders: dict[str, Path] = {}
         self._statuses: dict[str, dict[Path, str]] = {}
-        self._finished: dict[str, dict[int, Summary]] | None = None
+        self._finished: dict[str, dict[int, Summary]] = {}
+        self._known: dict[int, Summary] | None = None
+        shared = {} if sources is None else manifest.plain(sources.shared)
+        self._limits, self._described = (
+            manifest.digest(shared.get(key)) if sources else "" for key in ("limits", "descriptors")
+        )
 
-    def _note(self, sequence: str) -> None:
+    def of(self, sequence: str) -> Path:
+        """The folder of a sequence."""
+        if sequence not in self._folders:
+            name = self._last.get(sequence, sequence)
+            if self._sources is not None:
+                self._statuses[sequence] = self._sources.statuses(sequence)
+                digest = manifest.digest(_of_poses(self.inputs(sequence)))
+                name = f"{sequence}-{digest[: manifest.SHORT]}"
+            self._folders[sequence] = self.folder / name
+        return self._folders[sequence]
+
+    def _note(self, sequence: str) -> Path:
         """Record what the trials on a sequence depend on, before the first of them is written."""
-        path = self.folder / sequence / manifest.FILE
-        if self._sources is None or path.exists():
-            return
+        folder = self.of(sequence)
+        if self._sources is None or (folder / manifest.FILE).exists():
+            return folder
         now = self._sources.statuses(sequence)
-        if changed := dict(now.items() ^ self._statuses.get(sequence, now).items()):
+        if changed := dict(now.items() ^ self._statuses[sequence].items()):
             raise ConfigurationError(
                 f"{next(iter(changed))}: has changed while {sequence} was read, and nothing on "
                 f"{sequence} is stored; run the same command again"
             )
-        manifest.record(path, self._sources.inputs(sequence))
+        self._use(sequence)
+        return folder
+
+    def _use(self, sequence: str) -> None:
+        """Record what trials on a sequence depend on, and that these are those of now."""
+        folder = self.of(sequence)
+        self._last[sequence] = folder.name
+        write_text(self.folder / CURRENT, json.dumps(self._last, indent=1) + "\n")
+        manifest.record(folder / manifest.FILE, self.inputs(sequence))
 
     def inputs(self, sequence: str) -> dict[str, Any]:
         """All that trials on a sequence depend on now."""
         assert self._sources is not None
         return self._sources.inputs(sequence)
 
-    def changes(self, sequence: str) -> list[str]:
-        """In what this differs from what the stored trials depend on, in words."""
+    def begin(self) -> None:
+        """Say what has changed since the last run, and use what there is of what is now."""
         assert self._sources is not None
-        before = manifest.recorded(self.folder / sequence / manifest.FILE)
-        return manifest.changes(before, self.inputs(sequence), self._sources.files(sequence))
-
-    def renew(self, sequences: Sequence[str]) -> bool:
-        """Set aside what was computed from other inputs than there are now, and say why.
-
-        Earlier results of these inputs count again. Of trials on other sequences than these, only
-        what all share is compared. Returns whether trials were moved.
-        """
-        assert self._sources is not None
-        self._statuses = {name: self._sources.statuses(name) for name in sequences}
-        moved: list[Path] = []
         why: dict[str, None] = {}
-        for folder in sorted(self.folder.glob("*/")):
-            name = folder.name
-            files: Mapping[str, Sequence[Path]] = {}
-            before = manifest.recorded(folder / manifest.FILE)
-            now = {**(before or {}), **self._sources.shared}
-            if name in sequences:
-                now, files = self._sources.inputs(name), self._sources.files(name)
-            if outdated := self._outdated(name, before, now):
-                why |= dict.fromkeys(manifest.changes(before, now, files))
-                moved += outdated
-        if moved:
-            n = sum(_TRIAL.fullmatch(file.name) is not None for file in moved)
-            what = f"{n} trials are run" if n else f"{len(moved)} sequences are described"
-            _log.warning("%s again: %s", what, "; ".join(why))
-        self._finished = None
-        back = [file for name in sequences for file in self._bring_back(name)]
-        return any(_TRIAL.fullmatch(file.name) for file in [*moved, *back])
-
-    def _outdated(
-        self, name: str, before: manifest.Inputs | None, now: manifest.Inputs
-    ) -> list[Path]:
-        """Set aside the files of a sequence that depend on what has changed."""
-        folder, study = self.folder / name, self.folder.parent
-        differing = {key.partition(".")[0] for key, *_ in manifest.differences(before or {}, now)}
-        if not differing:
-            return []
-        partly = before is not None and differing <= {"descriptors", "limits"}
-        files = [] if partly else sorted(folder.glob("*.npz"))
-        if partly and "descriptors" in differing:
-            files += folder.glob("frames.npz")
-        if partly and "limits" in differing:
-            # A limit may have ended a drive of the whole recording alone.
-            faulty = {n for n, run in self.finished(name).items() if run.faults}
-            drives = [file for file in folder.glob("[0-9]*-*.npz") if _read_trial(file).faults]
-            faulty |= {int(file.name.partition("-")[0]) for file in drives}
-            files += (file for n in faulty for file in folder.glob(f"{n:05d}*.npz"))
-        manifest.set_aside(study, folder, before, files)
-        # The record changes last: until then, it is known what these depend on.
-        if partly:
-            manifest.record(folder / manifest.FILE, now)
-        else:
-            (folder / manifest.FILE).unlink(missing_ok=True)
-        return [folder / file.name for file in files]
-
-    def _bring_back(self, name: str) -> list[Path]:
-        """Let earlier results of the same inputs count again, unless numbers now mean others."""
-        assert self._sources is not None
-        study, folder = self.folder.parent, self.folder / name
-        if not (study / manifest.EARLIER).exists():
-            return []
-        now = self._sources.inputs(name)
-        sets = Archive(manifest.earlier(study, folder, now).parent).finished(name)
-        own = self.sets()
-        if any(own.get(number, run.parameters) != run.parameters for number, run in sets.items()):
-            return []
-        files = manifest.bring_back(study, folder, now)
-        if files:
-            _log.info("%s: %d earlier results count again", name, len(files))
-        self._finished = None
-        return files
+        n = 0
+        for name in self._sources.names:
+            last = self.folder / self._last.get(name, name)
+            if (before := manifest.recorded(last / manifest.FILE)) is not None:
+                files = self._sources.files(name)
+                why |= dict.fromkeys(manifest.changes(before, self.inputs(name), files))
+                n += max(0, len(_trials(last)) - len(self.finished(name)))
+            if (self.of(name) / manifest.FILE).exists():
+                self._use(name)
+        if why:
+            again = f"{n} trials are run again" if n else "since the last run"
+            _log.warning("%s: %s", again, "; ".join(why))
 
     def trial_path(
         self, sequence: str, number: int, whole: bool = False, bare: bool = False
@@ -307,7 +288,7 @@ class Archive:
         A `bare` drive is one of the whole without the health check.
         """
         whole = whole and not bare and not self.is_uncut(sequence)
-        return self.folder / sequence / f"{number:05d}{'-whole' * whole}{'-bare' * bare}.npz"
+        return self.of(sequence) / f"{number:05d}{'-whole' * whole}{'-bare' * bare}.npz"
 
     def tidy(self) -> None:
         """Remove unfinished files. No process may be writing."""
@@ -319,35 +300,63 @@ class Archive:
 
         It grows as trials are written.
         """
-        return self._all().setdefault(sequence, {})
-
-    def _all(self) -> dict[str, dict[int, Summary]]:
-        if self._finished is None:
-            self._finished = {}
-            paths = [path for path in self.folder.glob("*/*") if _TRIAL.fullmatch(path.name)]
-            for path in sorted(paths, key=lambda path: (path.parent, int(path.stem))):
-                of_sequence = self._finished.setdefault(path.parent.name, {})
-                of_sequence[int(path.stem)] = _read_summary(path)
-        return self._finished
+        if sequence not in self._finished:
+            sets, runs = self.sets(), self._runs(self.of(sequence))
+            same = {
+                n: run for n, run in runs.items() if sets.get(n, run.parameters) == run.parameters
+            }
+            self._finished[sequence] = same
+        return self._finished[sequence]
 
     def known(self) -> dict[int, Summary]:
-        """All finished trials, also on sequences that are no more used; of each, on one of them."""
-        return {number: run for trials in self._all().values() for number, run in trials.items()}
+        """All finished trials, also on sequences that are no more used; of each, on one of them.
+
+        So a number means one set everywhere.
+        """
+        if self._known is None:
+            self._known = {}
+            for folder in self._used():
+                for number, run in self._runs(folder).items():
+                    self._known.setdefault(number, run)
+        return self._known
 
     def sets(self) -> dict[int, ParameterSet]:
         """Their parameter sets."""
         return {number: run.parameters for number, run in self.known().items()}
 
+    def _used(self) -> list[Path]:
+        """The folders whose trials count; of sequences that are not driven, what all share does."""
+        if self._sources is None:
+            return [self.folder / name for name in self._last.values()] or [*self.folder.glob("*/")]
+        driven, others = [], []
+        for folder in sorted(self.folder.glob("*/")):
+            if (name := folder.name.rpartition("-")[0]) in self._sources.names:
+                driven += [folder] * (folder == self.of(name))
+                continue
+            before = manifest.recorded(folder / manifest.FILE) or {}
+            now = manifest.plain({**before, **self._sources.shared})
+            others += [folder] * (_of_poses(before) == _of_poses(now))
+        return driven + others
+
+    def _runs(self, folder: Path) -> dict[int, Summary]:
+        runs = {int(path.stem): _read_summary(path) for path in _trials(folder)}
+        return {number: run for number, run in runs.items() if self._counts(run)}
+
+    def _counts(self, run: Summary) -> bool:
+        """Whether a run does not depend on other limits than now."""
+        return not (run.faults and self._limits) or run.limits == self._limits
+
     def has_frames(self, sequence: str, names: Sequence[str]) -> bool:
         """Whether the data that all trials on a sequence share exists, with these descriptors."""
         try:
-            return list(self.read_frames(sequence).blocks) == list(names)
+            made = _unpacked(_read(self.of(sequence) / "frames.npz", ["made"])["made"])
+            return made == self._described and [*self.read_frames(sequence).blocks] == [*names]
         except ArchiveError:
             return False
 
     def is_uncut(self, sequence: str) -> bool:
         """Whether trials drive the whole recording; False where it is not described yet."""
-        path = self.folder / sequence / "frames.npz"
+        path = self.of(sequence) / "frames.npz"
         if not path.exists():
             return False
         data = _read(path, ["stretches", "stamps"])
@@ -356,11 +365,11 @@ class Archive:
 
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Write the data that all trials on a sequence share."""
-        self._note(sequence)
-        path = self.folder / sequence / "frames.npz"
+        path = self._note(sequence) / "frames.npz"
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(
                 file,
+                made=_packed(self._described),
                 stamps=frames.stamps,
                 T_ref_sensor=frames.T_ref_sensor,
                 descriptors=compact(frames.descriptors),
@@ -373,7 +382,7 @@ class Archive:
 
     def read_frames(self, sequence: str) -> Frames:
         """Read the data that all trials on a sequence share."""
-        path = self.folder / sequence / "frames.npz"
+        path = self.of(sequence) / "frames.npz"
         data = _read(path)
         try:
             return Frames(
@@ -398,11 +407,14 @@ class Archive:
         data = {name: getattr(trial, name) for name in _ARRAYS}
         data |= {name: getattr(trial, name).astype(np.float32) for name in _SINGLE}
         data |= {name: _packed(getattr(trial, name)) for name in _PLAIN}
-        data[_SUMMARY] = _packed(asdict(summary := summarise(trial)))
+        summary = replace(summarise(trial), limits=self._limits)
+        data[_SUMMARY] = _packed(asdict(summary))
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **data)
-        if path == self.trial_path(sequence, number) and self._finished is not None:
-            self._finished.setdefault(sequence, {})[number] = summary
+        if path == self.trial_path(sequence, number):
+            self.known().setdefault(number, summary)
+            self.finished(sequence)
+            self._finished[sequence][number] = summary
 
     def read(self, sequence: str, number: int, whole: bool = False, bare: bool = False) -> Trial:
         """Read a trial, or another drive, see `trial_path`."""
@@ -412,7 +424,10 @@ class Archive:
         self, sequence: str, number: int, whole: bool = False, bare: bool = False
     ) -> Summary:
         """Read the summary of a trial, or of another drive, see `trial_path`."""
-        return _read_summary(self.trial_path(sequence, number, whole, bare))
+        path = self.trial_path(sequence, number, whole, bare)
+        if not self._counts(found := _read_summary(path)):
+            raise ArchiveError(f"{path}: had a fault with other limits; run `adaptune offline`")
+        return found
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials).
@@ -430,9 +445,15 @@ class Archive:
                 read = np.full((len(errors), len(numbers)), np.nan, np.float32)
             if len(errors) != len(read):
                 what = "trials are of recordings of different lengths; remove the folder"
-                raise ArchiveError(f"{self.folder / sequence}: {what} and run again")
+                raise ArchiveError(f"{self.of(sequence)}: {what} and run again")
             read[:, i] = errors
         return np.empty((0, 0), np.float32) if read is None else read
+
+    def errors_of(self, sequence: str, sets: ParameterSets) -> dict[int, NDArray[np.float32]]:
+        """By number, the errors (n_frames,) of those of some sets that were run on a sequence."""
+        runs = self.finished(sequence)
+        known = [n for n in sets if n in runs and runs[n].parameters == sets[n]]
+        return dict(zip(known, self.read_errors(sequence, known).T, strict=True))
 
 
 def compact(descriptors: NDArray[np.float32]) -> NDArray[Any]:
@@ -470,9 +491,16 @@ def _read_trial(path: Path) -> Trial:
 
 
 def _read_summary(path: Path) -> Summary:
-    with suppress(ArchiveError):
+    try:
         return Summary(**_unpacked(_read(path, [_SUMMARY])[_SUMMARY]))
-    return summarise(_read_trial(path))  # it is of an earlier version, or damaged
+    except (TypeError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _trials(folder: Path) -> list[Path]:
+    """The files of trials, in the order of their numbers."""
+    paths = [path for path in folder.glob("*.npz") if _TRIAL.fullmatch(path.name)]
+    return sorted(paths, key=lambda path: int(path.stem))
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:

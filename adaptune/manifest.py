@@ -1,8 +1,8 @@
 """What a result was computed from: recorded beside it, compared, and said where it differs.
 
 Every result (described sequence, trial, model, replay, estimated reference) has its inputs as plain
-data beside it, with their digest. What has other inputs now is computed again. Nothing is lost: the
-earlier result moves to ``earlier/<digest>`` in the study's folder, and comes back with its inputs.
+data beside it, with their digest. Trials and replays are in folders named by it: what has other
+inputs is another result, and nothing is lost.
 """
 
 import hashlib
@@ -16,8 +16,8 @@ from adaptune.strict import ConfigurationError, in_one_line
 
 FILE = "inputs.json"
 """In the folder of a result."""
-EARLIER = "earlier"
-"""Folder of results of other inputs than there are now."""
+SHORT = 12
+"""Digits of a digest in the name of a folder."""
 _MAX_VALUE = 60
 """Characters of a value in words."""
 _CONTENTS = ("content", "descriptors", "recording", "reference", "scans")
@@ -125,36 +125,3 @@ def _changed_files(was: Sequence[str], now: Sequence[str], files: Sequence[Path]
     if len(was) == len(now) == len(files):
         return [file for file, a, b in zip(files, was, now, strict=True) if a != b]
     return [files[0].parent if files else "the reference"]
-
-
-def earlier(folder: Path, result: Path, inputs: Inputs) -> Path:
-    """Where a result of a study's folder is kept that was computed from other inputs."""
-    return folder / EARLIER / digest(inputs)[:12] / result.relative_to(folder)
-
-
-def set_aside(folder: Path, result: Path, before: Inputs | None, files: Iterable[Path]) -> None:
-    """Move files of a result, a folder in a study's folder, to where earlier results are kept."""
-    kept = earlier(folder, result, before or {})
-    for file in files:
-        to = kept / file.relative_to(result)
-        to.parent.mkdir(parents=True, exist_ok=True)
-        file.replace(to)
-    if before is not None:
-        record(kept / FILE, before)
-
-
-def bring_back(folder: Path, result: Path, now: Inputs) -> list[Path]:
-    """Move back the files of a result that was set aside with just these inputs, and return them.
-
-    None that is there already is replaced.
-    """
-    kept, found = earlier(folder, result, now), []
-    for file in sorted(kept.rglob("*")) if kept.exists() else ():
-        to = result / file.relative_to(kept)
-        if file.is_file() and file.name != FILE and not to.exists():
-            to.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(to)
-            found.append(to)
-    if found:
-        record(result / FILE, now)
-    return found

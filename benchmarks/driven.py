@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from adaptune.study.study import Study
 from offline.config import load_study
-from online.record import StoredReplay
+from online.modes import Replays
 from online.reference import read_reference
 
 MODES = ("baseline", "fixed", "even", "adaptive", "untrained")
@@ -31,9 +31,8 @@ def driven(study: Study, mode: str) -> tuple[list[float], NDArray[np.float64]]:
     """Mean RTE on each test sequence, and of each selection its truth, estimate, low and high."""
     errors, told = [], []
     for name in study.config.test:
-        folder = study.folder / "replays" / name
         reference = read_reference(study, name)
-        replay = StoredReplay.read(folder / mode)
+        replay = Replays.of(study).read(name, mode)
         errors.append(float(np.nanmean(reference.errors(replay.trajectory))))
         at = np.searchsorted(replay.trajectory.stamps, replay.choice_stamps)
         true = reference.errors_behind(replay.trajectory)[
@@ -47,8 +46,8 @@ def driven(study: Study, mode: str) -> tuple[list[float], NDArray[np.float64]]:
 def main() -> None:
     """Print the tables."""
     study = load_study(Path(sys.argv[1]) / "study.yaml", folder=Path(sys.argv[1]), needed=False)
-    first = study.folder / "replays" / study.config.test[0]
-    found = {mode: driven(study, mode) for mode in MODES if (first / mode).is_dir()}
+    first = Replays.of(study).made(study.config.test[0])
+    found = {mode: driven(study, mode) for mode in MODES if mode in first}
     errors = {mode: np.array(of) for mode, (of, _) in found.items()}
     for i, name in enumerate(study.config.test):
         print(f"{name:12s}", *(f"{mode} {of[i]:.3f} %" for mode, of in errors.items()), sep="  ")

@@ -95,8 +95,9 @@ def planted(old: Side, kind: str) -> Side:
     """The old side with more error."""
     folder = old.study.folder.with_name(f"{old.study.folder.name}_{kind}")
     shutil.copytree(old.study.folder, folder, ignore=shutil.ignore_patterns(".lock"))
-    for path in folder.glob("replays/*/baseline/trajectory.tum"):
-        replayed, reference = read_tum(path), read_tum(path.parents[1] / "reference.tum")
+    for path in folder.glob("replays/*/baseline-*/trajectory.tum"):
+        (judged,) = path.parents[1].glob("reference-*/reference.tum")
+        replayed, reference = read_tum(path), read_tum(judged)
         truth, odometry = reference.at(replayed.stamps), replayed.T_world_sensor
         poses = planted_poses(truth, odometry, old.study.config.sub_trajectory, kind)
         write_tum(path, Trajectory(replayed.stamps, poses))

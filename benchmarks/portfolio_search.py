@@ -34,8 +34,7 @@ from adaptune.report import tables
 from adaptune.study.references import ensure_references
 from offline.config import OfflineStudy, load_study
 from offline.train import train
-from online.modes import BASELINE, FIXED, UNTRAINED, replay_modes
-from online.record import StoredReplay
+from online.modes import BASELINE, FIXED, UNTRAINED, Replays, replay_modes
 from online.reference import read_reference
 
 WITH, WITHOUT = "portfolio", "none"
@@ -64,7 +63,7 @@ def study_of(given: argparse.Namespace, name: str, begun: Mapping[str, str], see
 
 def errors_of(study: OfflineStudy, name: str, mode: str) -> tuple[float, float]:
     """Mean RTE of a mode, and what it costs, in milliseconds of CPU time a scan."""
-    replayed = StoredReplay.read(study.folder / "replays" / name / mode)
+    replayed = Replays.of(study).read(name, mode)
     errors = read_reference(study, name).errors(replayed.trajectory)
     return float(np.nanmean(cap(errors))), replayed.summary.cpu_ms or np.nan
 
@@ -78,7 +77,7 @@ def row_of(given: argparse.Namespace, name: str, begun: Mapping[str, str], seed:
         ensure_references(study.sequences, study.training, study.config.sub_trajectory)
     else:
         trained, mode = train(study), FIXED
-        fitted = (trained.model, study.model_path)
+        fitted = trained.model
     tested = study.training[0] if given.untrained else study.config.test[0]
     replay_modes(study, [tested], (BASELINE, mode), unseen, fitted)
     (base, own), (error, ms) = (errors_of(study, tested, one) for one in (BASELINE, mode))

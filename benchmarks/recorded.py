@@ -57,8 +57,7 @@ from offline.choice import mean_and_error
 from offline.config import OfflineStudy, load_study
 from offline.labelled import LabelledData, labelled_data
 from offline.train import train, trial_workers
-from online.modes import run_replays, run_untrained
-from online.record import StoredReplay
+from online.modes import Replays, run_replays, run_untrained
 from online.reference import read_reference
 from online.statistics import ComparisonRow, compare_modes
 
@@ -163,9 +162,9 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
         shutil.copytree(own, references, dirs_exist_ok=True)
     rows: list[ComparisonRow] = []
     for name in study.config.test:
-        folder = study.folder / "replays" / name
-        also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
-        replays = {mode: StoredReplay.read(folder / mode) for mode in (*MODES, *also)}
+        stored = Replays.of(study)
+        also = [m for m in study.config.online.also if m in stored.made(name)]
+        replays = {mode: stored.read(name, mode) for mode in (*MODES, *also)}
         reference = read_reference(study, name)
         rows += compare_modes(name, replays, reference).rows
     return rows
@@ -237,8 +236,8 @@ def driven(given: argparse.Namespace, name: str) -> LabelledData:
     study = load_study(path, folder=folder)
     study.open()
     ensure_references(study.sequences, study.training, direction.sub_trajectory)
-    archive = study.archive(more={"offline": study.config.search_inputs})
-    archive.renew(study.training)
+    archive = study.archive()
+    archive.begin()
     with trial_workers(study, study.training, None) as workers:
         run_baseline(study, archive, workers, unseen)
         verdicts = Campaign(study, archive, workers).run()

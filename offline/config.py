@@ -473,8 +473,7 @@ class OfflineStudyConfig(StudyConfig):
     def search_inputs(self) -> dict[str, Any]:
         """What makes the trials of a study those that they are: another search has others."""
         offline = self.resolved()["offline"]
-        # The sets are shared, as trials of earlier versions have it recorded.
-        return {"sets": "shared"} | {k: value for k in _SEARCH if (value := offline.get(k))}
+        return {key: value for key in _SEARCH if (value := offline.get(key))}
 
 
 OfflineStudy = Study[OfflineStudyConfig]

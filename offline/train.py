@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune import __version__, manifest, trial_rows, yaml12
 from adaptune.archive import Archive, Summary
@@ -26,7 +27,6 @@ from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import ANY, COST, EQUAL, FILES, lost_in_words
-from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
@@ -189,11 +189,11 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     study.open()
     length = study.config.sub_trajectory
     ensure_references(study.sequences, study.training, length, progress)
-    archive = study.archive(more={"offline": study.config.search_inputs})
-    if archive.renew(study.training):
-        # Where nothing has been run, the search's time begins anew.
-        for path in () if archive.sets() else study.folder.glob("elapsed*.json"):
-            path.unlink()
+    archive = study.archive()
+    archive.begin()
+    # Where nothing has been run, the search's time begins anew.
+    for path in () if archive.known() else study.folder.glob("elapsed*.json"):
+        path.unlink()
     archive.tidy()
     return archive
 
@@ -383,8 +383,7 @@ def run_oracle(
     """
     model = study.model()
     archive, names = _on_test(study, model, oracle_sets(model, n_sets), progress, cluster)
-    found = {name: oracle_errors(archive, name, model) for name in names}
-    return [_oracle_row(name, errors) for name, errors in found.items() if errors is not None]
+    return [_oracle_row(name, archive.errors_of(name, model.sets), model.fixed) for name in names]
 
 
 def _on_test(
@@ -393,20 +392,19 @@ def _on_test(
     numbers: Sequence[int],
     progress: Progress,
     cluster: str | None,
-    kind: str = "oracle",
+    kind: Literal["oracle", "odometries"] = "oracle",
 ) -> tuple[Archive, list[str]]:
     """Run sets as trials on the test sequences with a reference; where they are, and on which."""
     study.open()
     names, archive = _judged(study, progress), study.archive(kind)
-    archive.renew(names)
-    for name in names:
-        _remove_other_sets(archive, name, model)
+    archive.begin()
     archive.tidy()
     schedule = Schedule(study, archive, "runs on test sequences", progress, measure=False)
     for name in names:
         schedule.need(name)
         for n in numbers:
-            if n not in archive.finished(name):
+            run = archive.finished(name).get(n)
+            if run is None or run.parameters != model.sets[n]:
                 schedule.add(name, n, model.sets[n])
     if schedule.waits():
         with trial_workers(study, names, cluster) as workers:
@@ -439,9 +437,7 @@ def odometry_rows(
     archive, names = _on_test(study, model, known, progress, cluster, "odometries")
     pairs: dict[int, list[Pair]] = {trial: [] for trial in known}
     for name in names:
-        if (found := oracle_errors(archive, name, model)) is None:
-            continue
-        errors = dict(zip(found.trials, cap(found.errors).T, strict=True))
+        errors = {n: cap(of) for n, of in archive.errors_of(name, model.sets).items()}
         block = span(archive.read_frames(name).counted, model.length)
         for trial, of in pairs.items():
             both = np.stack([errors[trial], errors[known[0]]])
@@ -486,22 +482,14 @@ def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
     return names
 
 
-def _remove_other_sets(archive: Archive, name: str, model: ErrorModel) -> None:
-    """Remove trials whose numbers are those of other sets in the model."""
-    for number, summary in archive.finished(name).items():
-        if number in model.sets and summary.parameters != model.sets[number]:
-            _log.info("%s: trial %d is run again: it is another set now", name, number)
-            archive.trial_path(name, number).unlink()
-
-
-def _oracle_row(name: str, found: OracleErrors) -> dict[str, Any]:
-    means = np.nanmean(cap(found.errors), axis=0)
-    best = int(means.argmin())
+def _oracle_row(name: str, errors: Mapping[int, NDArray[np.float32]], fixed: int) -> dict[str, Any]:
+    means = {n: float(np.nanmean(cap(of))) for n, of in errors.items()}
+    best = min(means, key=means.__getitem__)
     return {
         "sequence": name,
-        "fixed": float(means[0]),
-        "best": float(means[best]),
-        "best / fixed": float(means[best] / means[0]),
-        "trial": found.trials[best],
-        "sets": len(found.trials),
+        "fixed": means[fixed],
+        "best": means[best],
+        "best / fixed": means[best] / means[fixed],
+        "trial": best,
+        "sets": len(means),
     }

@@ -78,12 +78,11 @@ _RESTARTED = "restarted by the health check"
 
 def charts_of_replays(replayed: ReplayedSequence) -> Charts:
     """Charts of the replays of a sequence, in all modes that there are."""
-    yield from replayed.refused
     if replayed.modes:
         no_errors = f"No errors of the replays of {replayed.name}: it has no reference."
         yield error_chart(replayed) or no_errors
         yield choice_chart(replayed)
-    elif not replayed.refused:
+    else:
         yield f"No replays of {replayed.name}: run `adaptune online`."
 
 

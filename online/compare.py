@@ -1,15 +1,14 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
 import json
-from collections.abc import Collection, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import manifest
 from adaptune.metrics import LOST_ABOVE, worst_tenth
 from adaptune.model import ErrorModel, rules
 from adaptune.model.registry import ADAPTIVE
@@ -19,21 +18,11 @@ from adaptune.report import tables as report
 from adaptune.space import ODOMETRY
 from adaptune.study.config import ALSO
 from adaptune.study.driven import PER_STRETCH, lost_in_words
-from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
-from online.modes import (
-    BASELINE,
-    EVEN,
-    FIXED,
-    UNTRAINED,
-    WITHOUT_MODEL,
-    ReplaySetup,
-    replayed_modes,
-    sequences_without_model,
-)
-from online.record import ReplaySummary, StoredReplay, StoredReplayError
-from online.reference import check_reference, read_contradictions, read_reference
+from online.modes import BASELINE, EVEN, FIXED, WITHOUT_MODEL, Replays, sequences_without_model
+from online.record import StoredReplayError
+from online.reference import read_contradictions, read_reference
 from online.statistics import (
     ALL,
     NO_DIFFERENCE,
@@ -47,6 +36,8 @@ from online.statistics import (
 from online.tables import tables
 from online.verdict import adapts, called, choices, decided, late, remarks, verdict
 
+_log = logging.getLogger(__name__)
+
 
 class ComparedModes(NamedTuple):
     """What is compared."""
@@ -57,7 +48,7 @@ class ComparedModes(NamedTuple):
     words: list[str]  # sentences about what is not shown because it is missing
 
 
-def compared_modes(study: Study) -> ComparedModes:
+def compared_modes(replays: Replays) -> ComparedModes:
     """Find what was replayed on all test sequences, or without a model.
 
     Raises
@@ -65,12 +56,12 @@ def compared_modes(study: Study) -> ComparedModes:
     StoredReplayError
         If the fixed set was replayed on none of them, and the untrained bank neither.
     """
-    setup, replays, names = ReplaySetup.of(study), study.folder / "replays", study.config.test
-    made = {n: replayed_modes(replays / n) for n in sequences_without_model(study.config)}
+    study, setup, names = replays.study, replays.setup, replays.study.config.test
+    made = {name: replays.made(name) for name in sequences_without_model(study.config)}
     every = {mode for modes in made.values() for mode in modes}
     if names and "fixed" in every:
-        model = ErrorModel.load(study.model_path) if study.model_path.exists() else None
-        modes, asked, option = replace(setup, also=ALSO).modes(model), setup.modes(model), ""
+        modes = replace(setup, also=ALSO).modes
+        asked, option = setup.modes, ""
         due = every.intersection(("fixed", BASELINE, *setup.rules))
     else:
         modes, asked, option = WITHOUT_MODEL, WITHOUT_MODEL, " --untrained"
@@ -81,7 +72,8 @@ def compared_modes(study: Study) -> ComparedModes:
     if not finished and not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
-        ReplaySummary.read(replays / names[0] / "fixed")
+        for mode in WITHOUT_MODEL if replays.model is None else (FIXED,):
+            replays.read(names[0], mode)  # or an error
     compared = tuple(mode for mode in modes if all(mode in made[n] for n in finished))
     unfinished = tuple(name for name in made if name not in finished)
     missing = {m: [n for n in made if m not in made[n]] for m in asked}
@@ -89,6 +81,11 @@ def compared_modes(study: Study) -> ComparedModes:
     words = (
         f"Not compared, because replays are missing: {where}; `adaptune online{option}` makes them."
     )
+    others = {
+        (why, n): m for m, on in missing.items() for n in on if (why := replays.changes(n, m))
+    }
+    for (why, name), mode in others.items():
+        _log.warning("%s: the last replay of `%s` was made from other inputs: %s", name, mode, why)
     return ComparedModes(tuple(finished), compared, unfinished, [words] if where else [])
 
 
@@ -163,104 +160,6 @@ def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float6
     return np.log(found)
 
 
-class CurrentReplays(NamedTuple):
-    """The replays that are of what the study is now."""
-
-    model: ErrorModel | None  # what they are of; None if its file is not there any more
-    modes: tuple[str, ...]  # all of whose replays are current, in the order of `MODES`
-    refused: tuple[str, ...]  # sentences about the others
-
-
-def current_replays(
-    study: Study, names: Sequence[str], modes: Sequence[str] | None = None
-) -> CurrentReplays:
-    """Tell replays of another recording, model or configuration from the others.
-
-    Of replays with different models, those with the study's own are current. `names` are those of
-    sequences; `modes` are by default all that were replayed and that the study may have.
-
-    Raises
-    ------
-    StoredReplayError
-        If a replay is missing or damaged, or if they do not go together.
-    """
-    setup, replays = ReplaySetup.of(study), study.folder / "replays"
-    made = {
-        (name, mode): ReplaySummary.read(replays / name / mode)
-        for name in names
-        for mode in modes or replayed_modes(replays / name)
-    }
-    own = study.model_path.resolve()
-    path = _model_file(replays, made.values(), own)
-    model = None
-    if path.exists():
-        model = study.model(path) if path == own else ErrorModel.load(path)
-    if modes is None:
-        possible = replace(setup, also=ALSO).modes(model)
-        made = {key: summary for key, summary in made.items() if key[1] in possible}
-    if len({str(summary.inputs["real_time"]) for summary in made.values()}) > 1:
-        raise StoredReplayError(
-            f"{replays}: some were made in real time, and others not, or not so; "
-            f"run `adaptune online` again, with online.real_time.rate or without"
-        )
-    shared = {name: study.replay_inputs(name) for name in names}
-    refused: dict[tuple[str, str, str], list[str]] = {}
-    for (name, mode), summary in made.items():
-        if said := _differing(study, setup, summary.inputs, model, shared[name]):
-            command = "adaptune online"
-            if mode in ALSO and mode not in setup.also:
-                command += " --untrained" if mode == UNTRAINED else " -o online.modes=all"
-            if mode != UNTRAINED and path != own:
-                command += f" --model {path}"
-            refused.setdefault((name, command, "; ".join(said)), []).append(mode)
-    stale = {mode for those in refused.values() for mode in those}
-    current = tuple(dict.fromkeys(mode for _, mode in made if mode not in stale))
-    words = []
-    for (name, command, differing), those in refused.items():
-        folder = replays / name
-        what = f"{folder}: {', '.join(those)} were" if those[1:] else f"{folder / those[0]}: was"
-        words.append(
-            f"{what} made from other inputs: {differing}; run `{command}` with this study."
-        )
-    return CurrentReplays(model, current, tuple(words))
-
-
-def _differing(
-    study: Study,
-    setup: ReplaySetup,
-    inputs: manifest.Inputs,
-    model: ErrorModel | None,
-    shared: manifest.Inputs,
-) -> list[str]:
-    """In what a replay differs from one that would be made now, given what all modes share."""
-    # What was made in real time may be compared without saying so.
-    now, mode = {**shared, "real_time": inputs["real_time"]}, inputs["mode"]
-    if model is not None or mode in WITHOUT_MODEL:
-        own = setup.identity(mode, model, "" if model is None else model.digest)
-        now |= {key: own[key] for key in ("model", "parameters")}
-        both = own["switching"], inputs["switching"]
-        automatic = setup.config.online.switching.mechanism == "auto" and None not in both
-        # Another machine would choose another mechanism.
-        if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
-            now["switching"] = own["switching"]
-    files = study.sequences.sources(next(iter(shared["recording"])))
-    return manifest.changes({key: inputs.get(key) for key in now}, now, files)
-
-
-def _model_file(replays: Path, summaries: Collection[ReplaySummary], own: Path) -> Path:
-    """File of the model of replays, by default the study's own."""
-    models = ((summary.inputs["model"], summary.model_file) for summary in summaries)
-    files = {digest: file for digest, file in models if digest and file}
-    if len(files) == 1:
-        return Path(*files.values())
-    if files and not own.exists():
-        raise StoredReplayError(
-            f"{replays}: holds replays with different models "
-            f"({' and '.join(sorted(set(files.values())))}); run `adaptune online` again"
-        )
-    return own
-
-
 NONE = "none"
 """Advised where track is lost."""
 
@@ -290,35 +189,28 @@ def compare(study: Study) -> ComparedReplays:
         If that of the fixed set is missing, or one is damaged, or of another recording or
         configuration.
     """
-    compared = compared_modes(study)
+    replays = Replays.of(study)
+    compared, model = compared_modes(replays), replays.model
     names, modes = compared.sequences, compared.modes
-    model, _, refused = current_replays(study, names, modes)
-    if refused:
-        raise StoredReplayError(refused[0][:-1])
-    for name in names:
-        check_reference(study.folder / "replays" / name, study.sequences.reference(name))
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
     wrong: list[str] = []
     periods: dict[str, float] = {}  # milliseconds from scan to scan
     for name in names:
-        folder = study.folder / "replays" / name
-        replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
+        read = {mode: replays.read(name, mode) for mode in modes}
         reference = read_reference(study, name)
-        stamps = next(iter(replays.values())).trajectory.stamps
-        if len(stamps) > 1 and not any(replay.summary.real_time for replay in replays.values()):
+        stamps = next(iter(read.values())).trajectory.stamps
+        if len(stamps) > 1 and study.config.online.real_time is None:
             periods[name] = 1e-6 * float(np.median(np.diff(stamps)))
-        wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
-        of_modes = compare_modes(name, replays, reference)
-        if model is not None and model.fixed == rules.BASELINE:
-            of_modes = of_modes._replace(rows=_of_one_set(of_modes.rows))
+        wrong += [f"On {name}, {what}." for what in read_contradictions(study, name)]
+        of_modes = compare_modes(name, read, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         if model is not None:
-            errors = oracle_errors(study.archive("oracle"), name, model)
-            if errors and (row := oracle_row(judged[-1], errors, model.fixed)):
+            errors = study.archive("oracle").errors_of(name, model.sets)
+            if (row := oracle_row(judged[-1], errors, model.fixed)) is not None:
                 oracles.append(row)
     rows = _rows(judged, oracles)
-    obstacle = ReplaySetup.of(study).obstacle(ADAPTIVE, model) if ADAPTIVE not in modes else ""
+    obstacle = replays.setup.obstacle(ADAPTIVE) if ADAPTIVE not in modes else ""
     length = study.config.sub_trajectory
     recommended = FIXED if model is None else model.recommended
     best = decided(rows, recommended)
@@ -344,13 +236,6 @@ def _odometries(model: ErrorModel) -> dict[str, str]:
     """Of several odometries, those that baseline and fixed set drive."""
     both = {BASELINE: model.sets[rules.BASELINE], FIXED: model.sets[model.fixed]}
     return {mode: str(one[ODOMETRY]) for mode, one in both.items() if ODOMETRY in one}
-
-
-def _of_one_set(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
-    """The same where baseline and fixed set are one: what it costs is the mean of both drives."""
-    both = (BASELINE, FIXED)
-    cost = mean_of([row.cpu_ms for row in rows if row.mode in both])
-    return [replace(row, cpu_ms=cost) if row.mode in both else row for row in rows]
 
 
 def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> list[str]:
@@ -385,8 +270,7 @@ def _front(study: Study, model: ErrorModel | None) -> list[dict[str, Any]]:
     if model is None or not path.exists():
         return []
     rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
-    # Older ones are of another kind.
-    return rows if all("left out" in row for row in rows) else []
+    return rows
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

@@ -15,6 +15,7 @@ from adaptune.files import write_text
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.report.tables import Listing, markdown
+from adaptune.space import load_space
 from adaptune.study.driven import PER_STRETCH
 from adaptune.study.study import Study, is_written_to
 from online.modes import BASELINE, FIXED
@@ -41,15 +42,23 @@ class Side(NamedTuple):
     study: Study
 
     def replays(self, mode: str) -> dict[str, Driven]:
-        """What was replayed in a mode, by content and part of the recording."""
-        made = sorted((self.study.folder / "replays").glob(f"*/{mode}/replay.json"))
+        """What was replayed with the set of a mode, by content and part of the recording."""
+        study = self.study
+
+        def is_of_mode(inputs: manifest.Inputs) -> bool:
+            space = load_space(inputs["odometry"]["parameters"])
+            wanted = study.fixed if mode == FIXED else space.baseline
+            return wanted is not None and inputs["parameters"] == wanted
+
         # Earlier ones may be of recordings that the study does not name any more.
-        named = {*self.study.config.sequences, *self.study.config.courses}
         found = [
-            Driven(self.study, path.parents[1].name, ReplaySummary.read(path.parent))
-            for path in made
-            if path.parents[1].name in named
+            Driven(study, name, path.parent, ReplaySummary.read(path.parent))
+            for name in sorted([*study.config.sequences, *study.config.courses])
+            for path in (study.folder / "replays" / name).glob("*/replay.json")
         ]
+        found = [one for one in found if is_of_mode(one.summary.inputs)]
+        # Of several, that which would be made now, or the last one.
+        found.sort(key=lambda one: (not one.obstacle, one.made))
         return {_key(one): one for one in found}
 
 
@@ -178,7 +187,7 @@ def shared_replays(new: Side, old: Side) -> Shared:
     if not common[mode]:
         raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
     mine, others = found[mode]
-    pairs = [_paired((new, old), mode, (mine[key], others[key])) for key in common[mode]]
+    pairs = [_paired((new, old), (mine[key], others[key])) for key in common[mode]]
     return Shared(new, old, mode, pairs, alone)
 
 
@@ -198,30 +207,27 @@ def _check_same(sides: Sequence[Side], both: Sequence[Driven]) -> None:
     """Refuse another pace, another reading of the same recording, and another reference."""
     words = f"{both[0].name}: {sides[0].name} and {sides[1].name}"
     inputs = [one.summary.inputs for one in both]
-    for key in ("real_time", "period"):
-        if inputs[0][key] != inputs[1][key]:
-            given = " and ".join(json.dumps(of[key]) for of in inputs)
-            raise AdaptuneError(
-                f"{words} were replayed with other values of online.{key}: {given}; replay both "
-                f"alike"
-            )
+    paces = [of["real_time"] for of in inputs]
+    if paces[0] != paces[1]:
+        given = " and ".join(map(json.dumps, paces))
+        raise AdaptuneError(
+            f"{words} were replayed with other values of online.real_time: {given}; replay both "
+            f"alike"
+        )
     new, old = (
         {"reader": of["reader"], "settings": _settings(one)}
         for of, one in zip(inputs, both, strict=True)
     )
     if said := manifest.changes(old, new):
         raise AdaptuneError(f"{words} read it differently: {'; '.join(said)}; replay both alike")
-    paths = (one.folder / f"reference.{manifest.FILE}" for one in both)
     # Without the names of the sequence.
-    mine, other = (
-        [list(v.values()) for v in (manifest.recorded(path) or {}).values() if isinstance(v, dict)]
-        for path in paths
-    )
+    references = (one.study.sequences.reference(one.name) for one in both)
+    mine, other = ([list(about.values()) for about in of.values()] for of in references)
     if mine != other:
         raise AdaptuneError(f"{words} are judged by different references; name the same in both")
 
 
-def _paired(sides: Sequence[Side], mode: str, both: tuple[Driven, Driven]) -> Paired:
+def _paired(sides: Sequence[Side], both: tuple[Driven, Driven]) -> Paired:
     _check_same(sides, both)
     old = both[1].summary
     if (lacking := old.unhealthy.get("no_pose", 0)) >= MAX_SHARE_WITHOUT_POSE * old.scans:
@@ -230,7 +236,7 @@ def _paired(sides: Sequence[Side], mode: str, both: tuple[Driven, Driven]) -> Pa
             f"nothing compares with it; mend it, or leave the recording out"
         )
     new, reference = both[0], read_reference(sides[0].study, both[0].name)
-    mine, other = (StoredReplay.read(one.folder / mode) for one in both)
+    mine, other = (StoredReplay.read(one.folder) for one in both)
     stamps = np.intersect1d(mine.trajectory.stamps, other.trajectory.stamps)
     kept = [(replay, np.isin(replay.trajectory.stamps, stamps)) for replay in (mine, other)]
     errors = np.array([reference.errors(replay.trajectory)[at] for replay, at in kept])

@@ -5,8 +5,8 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -29,14 +29,14 @@ from adaptune.reference.carried import begin_of, without
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
-from adaptune.study.config import StudyConfig
+from adaptune.study.config import ALSO, StudyConfig
 from adaptune.study.driven import ModeError, bank_members, mechanism_of, no_bank
 from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import Mechanism, Study
 from adaptune.trajectory import Trajectory
 from online.real_time import replay_in_real_time
-from online.record import StoredReplay, replay_changes, write_replay
-from online.reference import is_reference_of, write_reference
+from online.record import StoredReplay, StoredReplayError, is_complete, write_replay
+from online.reference import CONTRADICTIONS, reference_folder, write_reference
 from online.replay import ReplayRecord, replay
 from online.selector_process import SelectorProcess
 
@@ -107,15 +107,16 @@ class ReplaySetup:
     rules: tuple[str, ...]  # selection rules to compare
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
     portfolio: tuple[ParameterSet, ...] = ()  # sets that are known to do well in some places
+    model: ErrorModel | None = None  # what modes select with
 
     @classmethod
-    def of(cls, study: Study) -> Self:
+    def of(cls, study: Study, model: ErrorModel | None = None) -> Self:
         """The setup of a study."""
         also = study.config.online.also
         of = (study.config, study.odometry, study.mechanism, study.rules)
-        return cls(*of, also, study.portfolio)
+        return cls(*of, also, study.portfolio, model)
 
-    def mode(self, name: str, model: ErrorModel | None = None) -> Mode:
+    def mode(self, name: str) -> Mode:
         """What a mode runs.
 
         Raises
@@ -125,14 +126,14 @@ class ReplaySetup:
         """
         if name == BASELINE:
             return Mode(name, {0: self.odometry.space.baseline})
-        if why := self.obstacle(name, model):
+        if why := self.obstacle(name):
             raise ModeError(f"{name} is not possible: {why}")
         if name == UNTRAINED:
             sets = self._untrained_sets()
             members = dict(zip(sets.trials, sets.parameters, strict=True))
             untrained = partial(UntrainedSelector, sets, self.config.sub_trajectory)
             return Mode(name, members, True, untrained)
-        model = needed(name, model)
+        model = needed(name, self.model)
         if name == FIXED:
             return Mode(name, {model.fixed: model.sets[model.fixed]})
         if name == EVEN:
@@ -149,12 +150,13 @@ class ReplaySetup:
         make = partial(Selector, model, name, list(members), descriptors)
         return Mode(name, members, True, make, _cost(model, members))
 
-    def obstacle(self, name: str, model: ErrorModel | None = None) -> str:
+    def obstacle(self, name: str) -> str:
         """Why a mode is not possible; empty if it is, as far as is known without a model."""
         if name in (BASELINE, FIXED):
             return ""
         if self.odometry.description.whole:
             return "a program that runs whole recordings cannot change its parameters"
+        model = self.model
         if name == UNTRAINED:
             differ = len(self._untrained_sets()) > 1
             why = "no parameters by which the members of a bank would differ (odometry.parameters)"
@@ -166,20 +168,22 @@ class ReplaySetup:
             return no_bank(self.mechanism, self.odometry)
         return ""
 
-    def modes(self, model: ErrorModel | None) -> tuple[str, ...]:
-        """What is replayed with a model, in the order of `MODES`: what is possible of all modes.
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """What is replayed, in the order of `MODES`: what is possible of all modes.
 
         Without the model, all is possible that is with any.
         """
         modes = {BASELINE, FIXED, *self.rules, *self.also}
-        modes |= set() if model is None else {model.recommended}
-        return in_order(name for name in modes if not self.obstacle(name, model))
+        modes |= set() if self.model is None else {self.model.recommended}
+        return in_order(name for name in modes if not self.obstacle(name))
 
-    def default(self, model: ErrorModel, steered: bool = False) -> str:
+    def default(self, steered: bool = False) -> str:
         """The mode that a robot drives: what is recommended; of a single set, with a stand-by."""
-        if model.recommended == ADAPTIVE and not steered and not self.obstacle(ADAPTIVE, model):
+        recommended = None if self.model is None else self.model.recommended
+        if recommended == ADAPTIVE and not steered and not self.obstacle(ADAPTIVE):
             return ADAPTIVE
-        return STANDBY if steered or not self.obstacle(STANDBY, model) else FIXED
+        return STANDBY if steered or not self.obstacle(STANDBY) else FIXED
 
     def instance(self, mode: Mode, sequence: str | None = None) -> OdometryInstance:
         """Make the odometry of a mode, or the bank.
@@ -195,29 +199,30 @@ class ReplaySetup:
         cores = 1 if mode.cost * pace <= ONE_CORE else available()
         return Bank(self.odometry, mode.sets, WARM_UP, self.config.lost_track, cores, rate)
 
-    def identity(
-        self, name: str, model: ErrorModel | None = None, digest: str = ""
-    ) -> dict[str, Any]:
-        """What a mode depends on, as plain data; `digest` is the model's."""
-        about: dict[str, Any] = dict.fromkeys(("parameters", "model", "switching"))
-        about["mode"] = name
-        if name in (BASELINE, FIXED):
-            mode = self.mode(name, model)
+    def identity(self, name: str) -> dict[str, Any]:
+        """What a mode depends on, as plain data."""
+        mode, keys = self.mode(name), ("parameters", "mode", "period", "model", "switching")
+        about: dict[str, Any] = dict.fromkeys(keys)
+        if mode.selector is None:  # no matter what the set is called
             return about | {"parameters": mode.sets[mode.fixed]}
-        switching: dict[str, Any] = {"mechanism": "bank", "warm_up": WARM_UP}
-        if name == UNTRAINED:
-            members = list(self._untrained_sets().parameters)
-            return about | {"switching": switching | {"members": members}}
-        if name not in MODES:
-            about |= {"rule": python_content(name, ENTRY_POINTS)}
-        if name != EVEN and self._mechanism(name, needed(name, model)) != "bank":
-            live = {"mechanism": "live"} | self.odometry.steering
-            return about | {"model": digest, "switching": live}
-        named = self.config.online.switching.model_dump(mode="json", include={"size", "sets"})
-        return about | {"model": digest, "switching": switching | named}
+        about |= {"mode": name, "period": self.config.online.period}
+        if mode.bank:
+            # A model's sets are known by their numbers.
+            members = [*(mode.sets.values() if name == UNTRAINED else mode.sets)]
+            about["switching"] = {"mechanism": "bank", "warm_up": WARM_UP, "members": members}
+        else:
+            about["switching"] = {"mechanism": "live"} | self.odometry.steering
+        if name != UNTRAINED:
+            about["model"] = self._digest
+        return about if name in MODES else about | {"rule": python_content(name, ENTRY_POINTS)}
 
-    def check(self, model: ErrorModel, path: Path) -> None:
+    @cached_property
+    def _digest(self) -> str | None:
+        return None if self.model is None else self.model.digest
+
+    def check(self, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
+        model = needed(str(path), self.model)
         model.check_descriptors(self.config.descriptor, path)
         online = self.config.online
         if model.budget != online.budget:
@@ -225,7 +230,7 @@ class ReplaySetup:
                 f"online.budget: {path} was fitted for another one; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
-        if self.mechanism == "bank" or (EVEN in self.also and not self.obstacle(EVEN, model)):
+        if self.mechanism == "bank" or (EVEN in self.also and not self.obstacle(EVEN)):
             self._members(model)
 
     def _mechanism(self, name: str, model: ErrorModel) -> Mechanism | None:
@@ -261,9 +266,58 @@ def in_order(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*(mode for mode in MODES if mode in there), *there)))
 
 
-def replayed_modes(folder: Path) -> tuple[str, ...]:
-    """The modes in which a sequence was replayed, see `in_order`, from their folder."""
-    return in_order(path.parent.name for path in folder.glob("*/replay.json"))
+class Replays:
+    """The replays of a study with an error model, if there is one.
+
+    Each is in a folder whose name ends with the digest of all that it is made from. So what differs
+    is another one, and none is made twice, whatever the mode is called.
+    """
+
+    def __init__(self, study: Study, model: ErrorModel | None = None):
+        self.study, self.model, self.setup = study, model, ReplaySetup.of(study, model)
+        self._shared = cache(study.replay_inputs)
+
+    @classmethod
+    def of(cls, study: Study) -> Self:
+        """Those with the study's own model."""
+        some = study.model_file is not None or study.model_path.exists()
+        return cls(study, study.model() if some else None)
+
+    def inputs(self, name: str, mode: str) -> dict[str, Any]:
+        """All that a replay of a sequence is made from, as plain data."""
+        return dict(manifest.plain(self._shared(name) | self.setup.identity(mode)))
+
+    def folder(self, name: str, mode: str) -> Path:
+        """Where a replay is, or will be."""
+        digest = manifest.digest(self.inputs(name, mode))[: manifest.SHORT]
+        folder = self.study.folder / "replays" / name
+        return next(folder.glob(f"*-{digest}"), folder / f"{mode}-{digest}")
+
+    def read(self, name: str, mode: str) -> StoredReplay:
+        """Read a replay; a StoredReplayError says that it is missing or damaged."""
+        folder = self.folder(name, mode)
+        if not (folder / "replay.json").exists():
+            why = self.changes(name, mode)
+            what = f"{mode} was made from other inputs: {why}" if why else f"there is no {mode}"
+            raise StoredReplayError(f"{folder.parent}: {what}; run `adaptune online` first")
+        return StoredReplay.read(folder)
+
+    def made(self, name: str) -> tuple[str, ...]:
+        """The modes in which a sequence was replayed, see `in_order`."""
+        if not (self.study.folder / "replays" / name).exists():
+            return ()
+        setup = replace(self.setup, also=ALSO)
+        possible = [m for m in setup.modes if self.model is not None or m in WITHOUT_MODEL]
+        return tuple(m for m in possible if (self.folder(name, m) / "replay.json").exists())
+
+    def changes(self, name: str, mode: str) -> str:
+        """In what the last replay differs from one that would be made now; empty without one."""
+        made = (self.study.folder / "replays" / name).glob(f"{mode}-*/replay.json")
+        last = max(made, key=lambda path: path.stat().st_mtime, default=None)
+        if last is None:
+            return ""
+        before, now = manifest.recorded(last.with_name(manifest.FILE)), self.inputs(name, mode)
+        return "; ".join(manifest.changes(before, now, self.study.sequences.sources(name)))
 
 
 def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
@@ -287,8 +341,8 @@ def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
 def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> int:
     """Replay every test sequence in every mode, unless that was done before.
 
-    ``replays/<sequence>/<mode>`` in the study's folder receives the results. Returned is the number
-    of replays that were made.
+    ``replays/<sequence>/<mode>-<digest>`` in the study's folder receives the results. Returned is
+    the number of replays that were made.
 
     Raises
     ------
@@ -296,16 +350,16 @@ def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> 
         If there is no test sequence, the model is of another odometry, other parameters or other
         sub-trajectories, or what the study's own model was fitted to has changed.
     """
-    setup = ReplaySetup.of(study)
     model = study.model(model_path)
-    setup.check(model, model_path)
+    setup = ReplaySetup.of(study, model)
+    setup.check(model_path)
     if not study.config.test:
         raise AdaptuneError("test: name at least one sequence to replay")
-    obstacles = {name: setup.obstacle(name, model) for name in study.config.online.modes}
+    obstacles = {name: setup.obstacle(name) for name in study.config.online.modes}
     for why in dict.fromkeys(filter(None, obstacles.values())):
         names = " and ".join(name for name, obstacle in obstacles.items() if obstacle == why)
         _log.warning("not replayed: %s, because %s", names, why)
-    return replay_modes(study, study.config.test, setup.modes(model), progress, (model, model_path))
+    return replay_modes(study, study.config.test, setup.modes, progress, model)
 
 
 def run_untrained(study: Study, progress: Progress = unseen) -> int:
@@ -328,51 +382,35 @@ def replay_modes(
     sequences: Sequence[str],
     modes: Sequence[str],
     progress: Progress,
-    fitted: tuple[ErrorModel, Path] | None = None,
+    model: ErrorModel | None = None,
 ) -> int:
     """Replay what was not replayed before; the number of replays that were made.
 
-    Sequences without a reference get an estimated one before, where that is possible. `fitted` is
-    the error model and its file. Baseline alone needs none.
+    Sequences without a reference get an estimated one before, where that is possible. They are
+    judged by it, and it by the first mode. Baseline alone needs no error model.
     """
     study.open()
     length = study.config.sub_trajectory
     refused = ensure_references(study.sequences, sequences, length, progress, required=False)
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
-    setup, made = ReplaySetup.of(study), 0
     in_vain = cache(lambda: _in_vain(study.odometry, study.sequences.open(sequences[0])))
-    model, model_path = fitted or (None, None)
-    digest = "" if model is None else model.digest
+    replays, made = Replays(study, model), 0
     with pin(os.getpid(), alone=True):  # the estimates had all cores
         for name in sequences:
-            folder, shared = study.folder / "replays" / name, study.replay_inputs(name)
-            every = [manifest.plain(setup.identity(mode, model, digest) | shared) for mode in modes]
-            due = [inputs for inputs in every if _is_due(study, name, inputs)]
-            live = [i["mode"] for i in due if setup.mode(i["mode"], model).live]
-            if live and (why := in_vain()):
-                _log.warning("%s is not replayed on %s: %s", " and ".join(live), name, why)
-                due = [inputs for inputs in due if inputs["mode"] not in live]
-            if not due and is_reference_of(folder, study.sequences.reference(name)):
-                continue
-            recording = study.sequences.open(name)
-            if due and study.odometry.description.whole:
-                study.sequences.program_input(name)  # may be written, which costs no mode
-            for i, inputs in enumerate(due):
-                mode = setup.mode(inputs["mode"], model)
-                release_memory()
-                try:
-                    instance, what = partial(setup.instance, mode, name), f"{name}, {mode.name}"
-                    record = _replayed(study, recording, instance, mode, what, progress)
-                except DescriptorError as error:
-                    raise AdaptuneError(f"sequences.{name}: {error}") from error
-                if i == 0:
-                    _judge(study, name, recording, record.trajectory)
-                write_replay(folder / mode.name, record, inputs, model_path)
-            if not due:
-                _judge(study, name, recording, StoredReplay.read(folder / modes[0]).trajectory)
-                _log.info("%s: the reference has changed; no replay depends on it", name)
-            made += len(due)
+            for number, mode_name in enumerate(modes):
+                folder = replays.folder(name, mode_name)
+                if not is_complete(folder):
+                    mode = replays.setup.mode(mode_name)
+                    if mode.live and (why := in_vain()):
+                        _log.warning("%s is not replayed on %s: %s", mode_name, name, why)
+                        continue
+                    if why := replays.changes(name, mode_name):
+                        _log.info("%s, %s: replayed again: %s", name, mode_name, why)
+                    _replay(replays, name, mode, folder, progress)
+                    made += 1
+                if number == 0 and not (reference_folder(study, name) / CONTRADICTIONS).exists():
+                    _judge(study, name, StoredReplay.read(folder).trajectory)
     return made
 
 
@@ -389,9 +427,10 @@ def _in_vain(odometry: Factory, recording: Recording) -> str:
     return ""
 
 
-def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) -> None:
+def _judge(study: Study, name: str, replayed: Trajectory) -> None:
     """Write the reference of a sequence, and what scans say where a replay disagrees with it."""
-    reference, wrong, sequences = recording.reference(), list[Finding](), study.sequences
+    recording, sequences = study.sequences.open(name), study.sequences
+    reference, wrong = recording.reference(), list[Finding]()
     if reference is not None:
         T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
         error = mean_difference(T_ref_sensor, T_odom_sensor, study.config.sub_trajectory)
@@ -400,26 +439,25 @@ def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) 
         reference = without(reference, wrong, begin_of(recording, replayed.stamps))
     for what in wrong:
         _log.warning("sequences.%s: %s", name, what)
-    folder = study.folder / "replays" / name
-    write_reference(folder, reference, replayed, sequences.reference(name), wrong)
+    write_reference(reference_folder(study, name), reference, replayed, wrong)
 
 
-def _is_due(study: Study, name: str, inputs: manifest.Inputs) -> bool:
-    """Whether a replay is to be made; one of other inputs is set aside, an earlier one kept."""
-    mode = inputs["mode"]
-    folder = study.folder / "replays" / name / mode
-    changes = replay_changes(folder, inputs, study.sequences.sources(name))
-    if changes:
-        _log.info("%s, %s: replayed again: %s", name, mode, "; ".join(changes))
-        before = manifest.recorded(folder / manifest.FILE)
-        manifest.set_aside(study.folder, folder, before, list(folder.iterdir()))
-    if changes != [] and manifest.bring_back(study.folder, folder, inputs):
-        _log.info("%s, %s: the earlier replay of these inputs counts again", name, mode)
-        changes = replay_changes(folder, inputs)
-    return changes != []
+def _replay(replays: Replays, name: str, mode: Mode, folder: Path, progress: Progress) -> None:
+    """Make a replay, and store it in a folder."""
+    study, what = replays.study, f"{name}, {mode.name}"
+    recording = study.sequences.open(name)
+    if study.odometry.description.whole:
+        study.sequences.program_input(name)  # may be written, which costs no mode
+    release_memory()
+    instance = partial(replays.setup.instance, mode, name)
+    try:
+        record = replayed(study, recording, instance, mode, what, progress)
+    except DescriptorError as error:
+        raise AdaptuneError(f"sequences.{name}: {error}") from error
+    write_replay(folder, record, replays.inputs(name, mode.name))
 
 
-def _replayed(
+def replayed(
     study: Study,
     recording: Recording,
     instance: Callable[[], OdometryInstance],
@@ -451,4 +489,4 @@ def _replayed(
     if again:
         raise AdaptuneError(f"{wrong}; mend the odometry, or leave the sequence out of the test")
     _log.warning("%s; so once more", wrong)
-    return _replayed(study, recording, instance, mode, what, progress, again=True)
+    return replayed(study, recording, instance, mode, what, progress, again=True)

@@ -23,7 +23,6 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.space import load_space
 from adaptune.strict import ConfigurationError, in_one_line
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, tum_lines, write_tum
 from online.replay import Choice, ReplayRecord
@@ -51,7 +50,6 @@ class ReplaySummary(BaseModel):
     lacking: int = 0  # scans without a pose
     fault: str = ""  # the last one of the odometry
     machine: str | None = None  # on which it was driven
-    model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
 
     @classmethod
@@ -61,36 +59,24 @@ class ReplaySummary(BaseModel):
         All files of a replay are there, for this one is written last.
         """
         path = folder / "replay.json"
-        if not path.exists():
-            raise StoredReplayError(
-                f"{folder}: there is no replay; run `adaptune online` with this study first"
-            )
         try:
             inputs = manifest.recorded(folder / manifest.FILE)
             summary = cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError, ConfigurationError) as error:
             raise damaged(path, error) from error
         if inputs is None:
-            what = "an older adaptune did not record what this replay was made from"
-            option = " --untrained" if folder.name == "untrained" else ""
-            raise StoredReplayError(f"{folder}: {what}; run `adaptune online{option}` again")
+            raise damaged(folder / manifest.FILE, FileNotFoundError("it is not there"))
         return summary.model_copy(update={"inputs": inputs})
 
 
-def replay_changes(
-    folder: Path, inputs: manifest.Inputs, files: Mapping[str, Sequence[Path]] | None = None
-) -> list[str] | None:
-    """In what a stored replay's inputs differ from others, in words; None if it is not complete."""
-    files_of_replay = ("replay.json", "trajectory.tum", "frames.csv", "selections.csv")
-    if not all((folder / name).exists() for name in files_of_replay):
-        return None
-    try:
-        before = manifest.recorded(folder / manifest.FILE)
-        if before is not None:
-            ReplaySummary.read(folder)
-        return manifest.changes(before, inputs, files)
-    except (StoredReplayError, ConfigurationError):
-        return None
+def is_complete(folder: Path) -> bool:
+    """Whether a replay is there, with all its files."""
+    with suppress(StoredReplayError):
+        ReplaySummary.read(folder)
+        return all(
+            (folder / n).exists() for n in ("trajectory.tum", "frames.csv", "selections.csv")
+        )
+    return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +133,7 @@ class StoredReplay:
             stamps = np.array(list(map(int, columns.pop("stamp_ns"))), np.int64)
             weights = _weights(columns.pop("weights"))
             selections = {name: _floats(columns.pop(name)) for name in _NUMBERS}
-            # Older versions did not write it.
-            states = np.array(columns.pop("state", ["unknown"] * len(stamps)), np.str_)
-            # Another version of adaptune may have written further columns.
-            if (about := summary.inputs.get("odometry")) is not None:
-                names = load_space(about["parameters"]).names
-                columns = {name: columns[name] for name in names if name in columns}
+            states = np.array(columns.pop("state"), np.str_)
         except (OSError, KeyError, ValueError) as error:
             raise damaged(path, error) from error
         if {len(frames[name]) for name in FRAME_COLUMNS[1:-1]} != {len(trajectory)}:
@@ -174,15 +155,10 @@ def switched(choices: Mapping[str, Sequence[Any]]) -> NDArray[np.bool_]:
     return np.array([False, *(a != b for a, b in itertools.pairwise(rows))])
 
 
-def write_replay(
-    folder: Path,
-    replay: ReplayRecord,
-    inputs: manifest.Inputs,
-    model_file: Path | None,
-) -> None:
+def write_replay(folder: Path, replay: ReplayRecord, inputs: manifest.Inputs) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
-    `inputs` is what it was made from, `model_file` the model that it was made with, if any.
+    `inputs` is what it was made from.
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     # Sets of several odometries have other parameters.
@@ -209,11 +185,11 @@ def write_replay(
         lacking=replay.lacking,
         fault=replay.faults[-1] if replay.faults else "",
         machine=machine(),
-        model_file=None if model_file is None else str(model_file.resolve()),
     )
     if replay.first_pose:
         what = "%s, %s: the odometry gave its first pose after %.1f s"
-        _log.info(what, folder.parent.name, folder.name, replay.first_pose)
+        mode, _, _ = folder.name.rpartition("-")
+        _log.info(what, folder.parent.name, mode, replay.first_pose)
     manifest.record(folder / manifest.FILE, inputs)
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
 

@@ -18,14 +18,12 @@ from adaptune.recording.export import Message, Messages
 from adaptune.recording.scan import Recording
 from adaptune.reference.judge import Reference
 from adaptune.selector import Periods
-from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
-from online.compare import current_replays
 from online.live import Placed, RosMessages, placed
-from online.modes import replayed_modes, sequences_without_model
+from online.modes import Replays, sequences_without_model
 from online.record import StoredReplay, StoredReplayError
-from online.reference import check_reference, read_reference
+from online.reference import read_reference
 
 CLOUD_PERIOD = 1.0
 """Seconds from one cloud to the next."""
@@ -52,7 +50,7 @@ _TIMES = ("prepare_ms", "register_ms", "late_ms")
 _PATH = "nav_msgs/msg/Path"
 
 
-def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str] = ()) -> list[str]:
+def replayed_sequences(study: Study, wanted: Sequence[str] = ()) -> list[str]:
     """The sequences of a study that were replayed, or those of them that are wanted.
 
     Raises
@@ -60,13 +58,14 @@ def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str]
     StoredReplayError
         If there is none, or not one that is wanted.
     """
+    config, replays = study.config, Replays.of(study)
     default = sequences_without_model(config)
     every = list(dict.fromkeys([*default, *config.sequences, *config.courses]))
     if unknown := [name for name in wanted if name not in every]:
         what = f"there is no such sequence in the study: {nearest(unknown[0], every)}"
         raise StoredReplayError(f"{unknown[0]}: {what}")
     names = list(dict.fromkeys(wanted or default))
-    found = [name for name in names if replayed_modes(replays / name)]
+    found = [name for name in names if replays.made(name)]
     missing = [name for name in names if name not in found]
     if missing and (wanted or not found):
         raise StoredReplayError(
@@ -87,19 +86,14 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
     Raises
     ------
     AdaptuneError
-        If a replay is damaged, or of other inputs than it would be made from now, or the disk is
-        full.
+        If a replay is damaged, or the disk is full.
     """
-    folder = study.folder / "replays" / name
-    _, modes, refused = current_replays(study, [name])
-    if refused:
-        raise StoredReplayError(refused[0][:-1])
-    replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
-    check_reference(folder, study.sequences.reference(name))
+    stored = Replays.of(study)
+    replays = {mode: stored.read(name, mode) for mode in stored.made(name)}
     reference = read_reference(study, name)
     known = reference.trajectory
     paths = {mode: _placed(replay.trajectory, known) for mode, replay in replays.items()}
-    placing = next((mode for mode in _PLACING if mode in modes), modes[0])
+    placing = next((mode for mode in _PLACING if mode in paths), next(iter(paths)))
     start = min(int(trajectory.stamps[0]) for trajectory in paths.values())
     composer = _Composer()
     clouds = composer.clouds(study.sequences.open(name), paths[placing], name, progress)

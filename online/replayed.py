@@ -17,10 +17,9 @@ from adaptune.study.driven import named
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, read_tum
-from online.compare import current_replays
-from online.modes import BASELINE, FIXED, UNTRAINED
+from online.modes import BASELINE, FIXED, UNTRAINED, Replays
 from online.record import StoredReplay
-from online.reference import check_reference, read_reference
+from online.reference import read_reference
 
 
 def scene_spans(
@@ -84,7 +83,6 @@ class ReplayedSequence:
     space: ParameterSpace
     scenes: Spans | None = None  # of a simulated course
     estimated: bool = False  # whether the reference was computed from the recording
-    refused: Sequence[str] = ()  # sentences about replays that are not among them
     # of banks by name, their sets in words
     members: Mapping[str, str] = field(default_factory=dict)
 
@@ -92,31 +90,23 @@ class ReplayedSequence:
 def read_replays(study: Study, name: str) -> ReplayedSequence:
     """Read the replays of a sequence that are finished and drawn; there may be none.
 
-    Those that `compare` refuses are not, see `online.compare.current_replays`.
-
-    Raises
-    ------
-    AdaptuneError
-        If a file is damaged, or if `compare` refuses all of them.
+    There is an AdaptuneError if a file is damaged.
     """
-    folder, reference = study.folder / "replays" / name, read_reference(study, name)
-    current = current_replays(study, [name])
-    if current.modes:
-        check_reference(folder, study.sequences.reference(name))
-    replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
-    modes = {mode: _read_mode(replay, reference, current.model) for mode, replay in replays.items()}
-    scenes = None
-    if replays:
-        stamps = next(iter(replays.values())).trajectory.stamps
-        scenes = scenes_along(study.sequences, name, stamps)
+    replays = Replays.of(study)
+    read, model = {mode: replays.read(name, mode) for mode in replays.made(name)}, replays.model
+    length, space = study.config.sub_trajectory, study.odometry.space
+    if not read:
+        return ReplayedSequence(name, length, {}, space)
+    reference = read_reference(study, name)
+    modes = {mode: _read_mode(mode, replay, reference, model) for mode, replay in read.items()}
+    scenes = scenes_along(study.sequences, name, next(iter(read.values())).trajectory.stamps)
     members = {
-        _member(replay, model, number): in_words(model.sets[number])
-        for replay in replays.values()
+        _member(mode, model, number): in_words(model.sets[number])
+        for mode, replay in read.items()
         for number in replay.weights
-        if (model := current.model) is not None and number in model.sets
+        if model is not None and number in model.sets
     }
-    about = study.odometry.space, scenes, reference.estimated, current.refused, members
-    return ReplayedSequence(name, reference.length, modes, *about)
+    return ReplayedSequence(name, length, modes, space, scenes, reference.estimated, members)
 
 
 def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]) -> Spans | None:
@@ -128,7 +118,9 @@ def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]
     return scene_spans(course.legs, read_tum(path), stamps) if path.exists() else None
 
 
-def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | None) -> ModeReplay:
+def _read_mode(
+    mode: str, replay: StoredReplay, reference: Reference, model: ErrorModel | None
+) -> ModeReplay:
     """Read a replay; `model` names the members of a bank."""
     stamps, truth = replay.trajectory.stamps, reference.trajectory
     places = _seen_from(replay.trajectory)
@@ -143,16 +135,16 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
         replay.choices,
-        {_member(replay, model, number): weights for number, weights in replay.weights.items()},
+        {_member(mode, model, number): weights for number, weights in replay.weights.items()},
         replay.estimated,
         replay.states,
         places,
     )
 
 
-def _member(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
+def _member(mode: str, model: ErrorModel | None, number: int) -> str:
     """What a member of a bank is called. Those of a bank without a model are no trials."""
-    if replay.summary.inputs["mode"] == UNTRAINED:
+    if mode == UNTRAINED:
         return f"untrained set {number}" if number else BASELINE
     if model is None or number not in model.sets:
         return f"trial {number}"

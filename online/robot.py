@@ -64,19 +64,18 @@ class RobotDrive:
         online = config.online.model_copy(update={"real_time": real_time})
         config = config.model_copy(update={"online": online})
         # What is only compared with is for replays.
-        setup = replace(ReplaySetup.of(study), config=config, also=())
+        model, modes = None if model_path is None else study.model(model_path), WITHOUT_MODEL
+        setup = replace(ReplaySetup.of(study, model), config=config, also=())
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
         self._like = _like(config, study.sequences)
         self._points = _named(self._ros.points or self._like.points, "online.ros.points")
         self._scans: LiveScans | None = None
         self._stopped = False
-        model, modes = None, WITHOUT_MODEL
         if model_path is not None:
-            model = study.model(model_path)
-            setup.check(model, model_path)
-            mode = mode or setup.default(model, steered=self._ros.steer is not None)
-            modes = (*dict.fromkeys((*setup.modes(model), ADAPTIVE, STANDBY)), UNTRAINED)
+            setup.check(model_path)
+            mode = mode or setup.default(steered=self._ros.steer is not None)
+            modes = (*dict.fromkeys((*setup.modes, ADAPTIVE, STANDBY)), UNTRAINED)
         if mode is None or mode not in modes:
             raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(str(mode), modes)}")
         if self._ros.steer is not None:
@@ -98,7 +97,7 @@ class RobotDrive:
                 f"robot (online.ros.steer)"
             )
         else:
-            self._mode = setup.mode(mode, model)
+            self._mode = setup.mode(mode)
 
     @property
     def mode(self) -> str:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from adaptune.metrics import cap
 from adaptune.paired import Interval, Pair, Ratio, in_cell, interval_of_mean, ratio
 from adaptune.reference.judge import Reference, StandardErrors, columns_of
-from adaptune.study.oracle import OracleErrors
 from adaptune.trajectory import Trajectory
 from online.record import StoredReplay, switched
 
@@ -223,18 +222,22 @@ def _estimated(estimates: NDArray[np.float64]) -> tuple[float | None, Interval]:
     return mean, (low, high) if np.isfinite([low, high]).all() else None
 
 
-def oracle_row(judged: JudgedModes, oracle: OracleErrors, fixed: int) -> ComparisonRow | None:
-    """Row of the best set of the sequence by `oracle`; None where nothing is known.
+def oracle_row(
+    judged: JudgedModes, oracle: Mapping[int, NDArray[np.float32]], fixed: int
+) -> ComparisonRow | None:
+    """Row of the best set of the sequence by the errors of trials; None where nothing is known.
 
-    `fixed` is the trial number of the fixed set: without its trial, nothing is known.
+    `fixed` is the number of the fixed set: without its trial, nothing is known.
     """
     yardstick = judged.rows[0].yardstick
     rte = next(row.rte for row in judged.rows if row.mode == yardstick)
-    errors = cap(oracle.errors)
+    if rte is None or fixed not in oracle:
+        return None
+    errors = cap(np.stack([*oracle.values()], axis=1))
     known = ~np.isnan(errors).any(axis=1)
-    if rte is None or fixed not in oracle.trials or not known.any():
+    if not known.any():
         return None
     means = errors[known].mean(axis=0)
     # A trial leaves its warm-up out, and a replay does not: only the ratio carries over.
-    ratio = float(means.min()) / max(float(means[oracle.trials.index(fixed)]), 1e-12)
+    ratio = float(means.min()) / max(float(means[[*oracle].index(fixed)]), 1e-12)
     return ComparisonRow(judged.name, ORACLE, rte * ratio, ratio, yardstick=yardstick)

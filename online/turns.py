@@ -20,9 +20,8 @@ from adaptune.odometry.tracker import Tracker
 from adaptune.paired import Pair, Ratio, along, joined, pooled
 from adaptune.progress import Progress, unseen
 from adaptune.study.study import Study
-from online.real_time import replay_in_real_time
+from online.modes import Mode, replayed
 from online.record import ReplaySummary, kept_up, machine
-from online.replay import replay
 
 COST, P99 = "cost", "pose, 99th percentile"
 """Milliseconds: of CPU time a scan; in real time, within which 99 % of the poses are there."""
@@ -39,12 +38,13 @@ class Driven(NamedTuple):
 
     study: Study
     name: str  # of the recording
+    folder: Path  # of the replay
     summary: ReplaySummary
 
     @property
-    def folder(self) -> Path:
-        """Of the recording's replays, and of their reference."""
-        return self.study.folder / "replays" / self.name
+    def made(self) -> float:
+        """When, in seconds."""
+        return (self.folder / "replay.json").stat().st_mtime
 
     @property
     def obstacle(self) -> str:
@@ -57,22 +57,17 @@ class Driven(NamedTuple):
         said = manifest.changes({key: recorded.get(key) for key in now}, now)
         return f"{self.study.name} has changed since: {'; '.join(said)}" if said else ""
 
-    def instance(self) -> closing[OdometryInstance]:
+    def odometry(self) -> OdometryInstance:
         """The odometry with the parameters of the replay."""
-        return closing(self.study.odometry(self.summary.inputs["parameters"], self.name))
+        return self.study.odometry(self.summary.inputs["parameters"], self.name)
 
     def run(self, show: Progress) -> dict[str, float]:
         """Drive it from end to end: its cost, as one figure a quantity."""
-        config, recording = self.study.config, self.study.sequences.open(self.name)
-        what, n = f"{self.name}, cost of {self.study.name}", recording.n_messages
-        with self.instance() as odometry:
-            given = recording, odometry, config.health
-            if config.online.real_time is None:
-                return {COST: replay(*given, what=what).cpu_ms}
-            record = replay_in_real_time(
-                *given, config.online.real_time, watch=lambda of: show(what, of.done, n), what=what
-            )
-        return {COST: record.cpu_ms, P99: (kept_up(record) or {})["pose_ms_p99"]}
+        recording, what = self.study.sequences.open(self.name), f"cost of {self.study.name}"
+        mode = Mode(COST, {0: self.summary.inputs["parameters"]})
+        given = self.study, recording, self.odometry, mode, f"{self.name}, {what}", show
+        kept = kept_up(record := replayed(*given))
+        return {COST: record.cpu_ms} | ({} if kept is None else {P99: kept["pose_ms_p99"]})
 
 
 def by_turns(both: Sequence[Driven], folder: Path, show: Progress) -> Costs:
@@ -111,7 +106,7 @@ def _scan_by_scan(
     what, n = f"{both[0].name}, cost of both", recording.n_messages
     costs: list[list[float]] = [[], []]
     with ExitStack() as stack:
-        odometries = [stack.enter_context(one.instance()) for one in both]
+        odometries = [stack.enter_context(closing(one.odometry())) for one in both]
         trackers = [
             Tracker(odometry, one.study.config.health)
             for odometry, one in zip(odometries, both, strict=True)

@@ -36,7 +36,7 @@ from adaptune.strict import ConfigurationError
 from adaptune.trajectory import read_tum
 from offline.config import OfflineStudyConfig, load_study
 from offline.train import train
-from online.modes import run_replays
+from online.modes import Replays, run_replays
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -257,7 +257,7 @@ def test_the_loop_on_a_robot_is_what_adaptune_online_does(folder):
         poses = []
         example = text.replace('"my.yaml"', f'"my.yaml", {overrides}')
         exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})
-        replays = study.folder / "replays/home/standby"
+        replays = Replays.of(study).folder("home", "standby")
         replayed = read_tum(replays / "trajectory.tum")
         np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
         assert (":" in (replays / "selections.csv").read_text()) is (mechanism == "bank")

@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -220,6 +221,7 @@ def compare(
     out: Out = Path("runs/compare"),
     override: Override = [],  # noqa: B006
     folder: Folder = None,
+    model: Model = None,
     details: Details = False,
 ) -> None:
     """Compare the replays: what to drive, what adapting gained, and at what cost.
@@ -241,8 +243,9 @@ def compare(
     of_bags |= {"--reference": reference, "--as": reading}
     of_both = of_bags | {"--sub-trajectory": sub_trajectory}
     if against is not None:
-        if override or folder or details:
-            raise AdaptuneError("-o, --folder and --details go with one study, not with --against")
+        if override or folder or model or details:
+            words = "-o, --folder, --model and --details go with one study, not with --against"
+            raise AdaptuneError(words)
         if not recordings and any(of_bags.values()):
             raise AdaptuneError(f"{_given(of_bags)}: goes with the bags to drive; name them, too")
         if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
@@ -255,11 +258,15 @@ def compare(
         raise AdaptuneError(f"{_given(of_both)}: goes with --against, which names the other side")
     from adaptune.tuning.tuned import compared
 
-    loaded = load(Path(study), override, folder)
+    loaded = _with_model(load(Path(study), override, folder), model)
     begin_work()
     found, page = compared(loaded)
     say_compared(loaded, found, page, details=details)
     _say_next(loaded, found)
+
+
+def _with_model(loaded: "OfflineStudy", model: Path | None) -> "OfflineStudy":
+    return loaded if model is None else replace(loaded, model_file=model)
 
 
 def _say_next(loaded: "OfflineStudy", found: "ComparedReplays") -> None:
@@ -359,6 +366,7 @@ def record(
     ] = None,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
+    model: Model = None,
 ) -> None:
     """Write replays as MCAP files to look at, with Foxglove or Rerun.
 
@@ -366,11 +374,11 @@ def record(
     chosen parameters or weights, the predicted, estimated and true errors, and the time that each
     step took. The replays stay as they are.
     """
-    loaded = load(study, override, folder)
+    loaded = _with_model(load(study, override, folder), model)
     from online.recordings import record_replays, replayed_sequences
 
     with progress() as show:
-        names = replayed_sequences(loaded.folder / "replays", loaded.config, sequences or ())
+        names = replayed_sequences(loaded, sequences or ())
         written = [record_replays(loaded, name, show) for name in names]
     for path in written:
         say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")

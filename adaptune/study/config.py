@@ -277,6 +277,11 @@ class StudyConfig(StrictModel):
         return ()
 
     @property
+    def search_inputs(self) -> dict[str, Any]:
+        """What makes the trials of a study those that they are: another search has others."""
+        return {}
+
+    @property
     def portfolios(self) -> Mapping[str, str]:
         """Odometries whose portfolio is used, or files of portfolios, and the digest of each."""
         return {}

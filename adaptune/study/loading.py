@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from adaptune import errors, yaml12
+from adaptune.archive import CURRENT
 from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
@@ -243,6 +244,10 @@ def read_study(
         mistakes.sort(key=lambda mistake: document.line(mistake.where) or 0)
         said = dict.fromkeys(_say(m, given, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
+    for older in ("trials/*/inputs.json", "replays/*/reference.inputs.json"):
+        if any(folder.glob(older)) and not (folder / "trials" / CURRENT).exists():
+            what = "its trials and replays are of an older adaptune, which kept them in another way"
+            raise ConfigurationError(f"{folder}: {what}; run again with another --folder")
     return Study(config, folder)
 
 

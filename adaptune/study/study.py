@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -65,6 +64,7 @@ class Study(Generic[C_co]):
 
     config: C_co
     folder: Path  # keeps trials, model, replays and comparison
+    model_file: Path | None = None  # of another error model than the study's own
 
     def __repr__(self) -> str:
         odometries, training, test = (
@@ -81,7 +81,7 @@ class Study(Generic[C_co]):
     @property
     def model_path(self) -> Path:
         """File of the error model."""
-        return self.folder / MODEL
+        return self.model_file or self.folder / MODEL
 
     @cached_property
     def sequences(self) -> StudySequences:
@@ -175,27 +175,27 @@ class Study(Generic[C_co]):
         """What the replays of a sequence depend on in all modes, as plain data."""
         in_real_time = self.config.online.real_time
         return {
-            "period": self.config.online.period,
             "real_time": in_real_time and in_real_time.model_dump(mode="json"),
             "health": self.config.health.model_dump(mode="json"),
             **self.odometry_inputs,
             **self.sequences.identity(name),
         }
 
-    def archive(self, kind: str = "trials", more: Mapping[str, Any] | None = None) -> Archive:
-        """The archive of the trials, or of other ones in the folder `kind`.
+    def archive(self, kind: Literal["trials", "oracle", "odometries"] = "trials") -> Archive:
+        """The archive of the trials, or of those on the test sequences in the folder `kind`.
 
-        It records what they depend on: odometry, sequences, descriptors, and `more`.
+        It knows what they depend on: odometry, sequences, descriptors, and the search.
         """
         config = self.config
+        names = config.training if kind == "trials" else config.test
         shared = self.odometry_inputs | {
             "sub_trajectory": config.sub_trajectory,
             "lost_track": config.lost_track,
             "drives": {"health": config.health.model_dump(mode="json")},
             "descriptors": descriptor_content(config.descriptor),
-            **(more or {}),
+            "offline": config.search_inputs,
         }
-        sources = Sources(shared, self.sequences.inputs, self.sequences.sources)
+        sources = Sources(names, shared, self.sequences.inputs, self.sequences.sources)
         return Archive(self.folder / kind, sources)
 
     @property
@@ -203,12 +203,12 @@ class Study(Generic[C_co]):
         """Everything that the study's trials, and so its error model, depend on."""
         archive = self.archive()
         inputs = manifest.merged(archive.inputs(name) for name in self.training)
-        return {key: value for key, value in inputs.items() if key != "limits"}
+        return {key: value for key, value in inputs.items() if key not in ("limits", "offline")}
 
     @property
     def model_inputs_path(self) -> Path:
-        """File of what the error model was fitted to."""
-        return self.model_path.with_suffix(f".{manifest.FILE}")
+        """File of what the study's own error model was fitted to."""
+        return (self.folder / MODEL).with_suffix(f".{manifest.FILE}")
 
     def model(self, path: Path | None = None) -> ErrorModel:
         """Load an error model, by default the study's own.
@@ -219,7 +219,7 @@ class Study(Generic[C_co]):
         path = path or self.model_path
         model = ErrorModel.load(path)
         files: dict[str, Any] = {}
-        if path.resolve() == self.model_path.resolve():
+        if path.resolve() == (self.folder / MODEL).resolve():
             before, now = manifest.recorded(self.model_inputs_path), self.model_inputs
             if before is not None and model.provenance.get("inputs") != manifest.digest(before):
                 before = None

@@ -29,7 +29,7 @@ from adaptune.tuning.studies import is_image
 from adaptune.yaml12 import Document
 from offline.config import OfflineStudy, load_study
 from online.gate import Gate, Shared, Side, compare_sides, shared_replays
-from online.modes import BASELINE, replay_modes, sequences_without_model
+from online.modes import BASELINE, FIXED, replay_modes, sequences_without_model
 from online.turns import Costs, by_turns
 
 _log = logging.getLogger(__name__)
@@ -54,15 +54,16 @@ def sides(
     studies = _driven(given, asked, show) if asked.recordings else _studies(called)
     _drive(studies, called, show)
     studies = studies if length is None else [_over(length, one) for one in studies]
-    for name, study in zip(called, studies, strict=True):
-        made = [path.stat().st_mtime for path in study.folder.glob("replays/*/*/replay.json")]
+    new, old = (Side(name, study) for name, study in zip(called, studies, strict=True))
+    for side in (new, old):
+        replays = (side.replays(mode).values() for mode in (FIXED, BASELINE))
+        made = [one.made for of in replays for one in of]
         if made and (first := min(made)) < now:
             _log.info(
-                f"{name}: its replays of {datetime.fromtimestamp(first):%Y-%m-%d %H:%M} are "
+                f"{side.name}: its replays of {datetime.fromtimestamp(first):%Y-%m-%d %H:%M} are "
                 f"compared. Libraries and other files that it loads may have changed since; to "
-                f"drive it anew, remove {study.folder / 'replays'}"
+                f"drive it anew, remove {side.study.folder / 'replays'}"
             )
-    new, old = (Side(name, study) for name, study in zip(called, studies, strict=True))
     return new, old
 
 
@@ -220,7 +221,7 @@ def _drive(studies: Sequence[OfflineStudy], called: Sequence[str], show: Progres
     due = [
         (name, side, study)
         for side, study in zip(called, studies, strict=True)
-        if not list((study.folder / "replays").glob("*/fixed/replay.json"))
+        if not Side(side, study).replays(FIXED)
         for name in sequences_without_model(study.config)
     ]
     for name, side, study in sorted(due, key=lambda one: one[0]):

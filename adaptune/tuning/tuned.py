@@ -245,11 +245,11 @@ def tune_asked(
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
-        of_each, fitted = list[dict[str, Any]](), (training.model, study.model_path)
+        of_each = list[dict[str, Any]]()
         hours, test = study.config.offline.hours, study.config.test
         try:
             if hours is not None:  # what decides comes first, whatever it takes
-                replay_modes(study, test, (BASELINE, FIXED), show, fitted)
+                replay_modes(study, test, (BASELINE, FIXED), show, training.model)
                 show = within(hours, clock, show)
             run_replays(study, study.model_path, show)
             of_each = odometry_rows(study, training, show, cluster)

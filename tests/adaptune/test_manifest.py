@@ -8,7 +8,7 @@ import pytest
 from small_bag import replace_bag
 
 from adaptune import manifest
-from adaptune.archive import Frames, Trial
+from adaptune.archive import Archive, Frames, Trial
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import write_tum
 from offline.config import load_study
@@ -54,7 +54,9 @@ def load(study_file, tmp_path, monkeypatch):
     (tmp_path / "program.yaml").write_text(program)
 
     def make(*overrides, file="small.yaml"):
-        return load_study(tmp_path / file, overrides, tmp_path / "run")
+        # Else the number of sequences says how many stretches of each are driven.
+        given = [*overrides, "offline.stretches=all"]
+        return load_study(tmp_path / file, given, tmp_path / "run")
 
     yield make
     sys.modules.pop(module, None)
@@ -74,26 +76,26 @@ def trial(parameters):
 def run(study, n=2):
     """Store trials on both training sequences, and frames."""
     archive = study.archive()
-    moved = archive.renew(study.training)
+    archive.begin()
     frames = Frames(np.arange(3), np.tile(np.eye(4), (3, 1, 1)), np.zeros((3, 1)), {}, np.zeros(3))
     for name in study.training:
         archive.write_frames(name, frames)
         for number in range(n):
             if number not in archive.finished(name):
                 archive.write(name, number, trial({"a": number}))
-    return moved
 
 
-def files(study, folder="trials"):
-    return sorted(f"{p.parent.name}/{p.stem}" for p in (study.folder / folder).rglob("*.npz"))
+def finished(archive, names=("one", "two")):
+    return [f"{name}/{number:05d}" for name in names for number in sorted(archive.finished(name))]
 
 
-def renewed(study, caplog):
-    """What is said when a study is resumed, and the trials that are left."""
+def begun(study, caplog):
+    """What is said when a study is resumed, and the trials that count."""
     caplog.clear()
-    study.archive().renew(study.training)
-    said = [m for m in caplog.messages if " again: " in m]
-    return " ".join(said), [name for name in files(study) if "frames" not in name]
+    archive = study.archive()
+    archive.begin()
+    said = [m for m in caplog.messages if "again: " in m or "since" in m]
+    return " ".join(said), finished(archive)
 
 
 ONE, TWO = ["one/00000", "one/00001"], ["two/00000", "two/00001"]
@@ -118,7 +120,7 @@ def test_what_did_not_change_is_not_run_again(load, caplog):
     run(load())
     more = ["sequences.one.cache=false", "offline.trials=3", "online.period=2"]
     for study in (load(), load(*more), load("training=[two, one]")):
-        assert renewed(study, caplog) == ("", ONE + TWO)
+        assert begun(study, caplog) == ("", ONE + TWO)
     assert load("training=[two, one]").model_inputs == load().model_inputs
 
 
@@ -143,12 +145,12 @@ def test_what_was_edited_is_run_again(load, tmp_path, caplog, edited, study, lef
         replace_bag(path)
     else:
         path.write_text(path.read_text() + "\n# other\n")
-    said, found = renewed(again(), caplog)
+    said, found = begun(again(), caplog)
     told = rf"{4 - len(left)} trials are run again: .*{path.stem}.* has other content"
     assert re.fullmatch(told, said)
     assert found == left
-    moved = [name for name in files(again(), "earlier") if "frames" not in name]
-    assert moved == [name for name in ONE + TWO if name not in left]
+    # Nothing is lost.
+    assert len(list((again().folder / "trials").glob("*/0000*.npz"))) == 4
 
 
 def test_a_recording_may_move(load, tmp_path, caplog):
@@ -158,33 +160,40 @@ def test_a_recording_may_move(load, tmp_path, caplog):
     moved = load(
         "sequences.one.bag=other_one.bag", f"sequences.one.reference={tmp_path}/other_one.tum"
     )
-    assert renewed(moved, caplog) == ("", ONE + TWO)
+    assert begun(moved, caplog) == ("", ONE + TWO)
 
 
 def test_earlier_trials_count_again(load, caplog):
     run(load())
     other = "odometry.settings.downsampling=0.7"
-    said, left = renewed(load(other), caplog)
+    said, left = begun(load(other), caplog)
     assert said == "4 trials are run again: odometry.settings.downsampling changed from 0.5 to 0.7"
     assert left == []
     run(load(other), 1)
-    assert run(load())
-    assert files(load()) == sorted([*ONE, *TWO, "one/frames", "two/frames"])
-    assert run(load(other), 1)
-    assert renewed(load(other), caplog) == ("", ["one/00000", "two/00000"])
+    said, left = begun(load(), caplog)
+    assert said == "since the last run: odometry.settings.downsampling changed from 0.7 to 0.5"
+    assert left == ONE + TWO
+    assert begun(load(), caplog) == ("", ONE + TWO)
+    assert begun(load(other), caplog)[1] == ["one/00000", "two/00000"]
+    assert len(Archive(load().folder / "trials").sets()) == 1
 
 
-def test_earlier_trials_whose_numbers_mean_other_sets_stay_away(load, tmp_path, caplog):
+def test_a_number_means_one_set_everywhere(load, tmp_path):
     run(load())
     bag = (tmp_path / "two.bag").read_bytes()
     replace_bag(tmp_path / "two.bag", 7)
-    run(load("training=[one]"))
-    load().archive().renew(["one", "two"])
-    for name in ("00000", "00001"):
-        (load().folder / f"trials/one/{name}.npz").unlink()
+    archive = load().archive()
+    for number in (0, 1):
+        archive.trial_path("one", number).unlink()
     load().archive().write("one", 0, trial({"a": "another"}))
     (tmp_path / "two.bag").write_bytes(bag)
-    assert renewed(load(), caplog)[1] == ["one/00000"]
+    archive = load().archive()
+    assert finished(archive) == ["one/00000", "two/00001"]
+    assert archive.sets() == {0: {"a": "another"}, 1: {"a": 1}}
+    archive.write("two", 0, trial({"a": "another"}))
+    assert (
+        finished(archive) == finished(load().archive()) == ["one/00000", "two/00000", "two/00001"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -200,7 +209,7 @@ def test_earlier_trials_whose_numbers_mean_other_sets_stay_away(load, tmp_path, 
 )
 def test_a_key_that_has_another_value(load, override, words, caplog):
     run(load(file="program.yaml"))
-    said, left = renewed(load(override, file="program.yaml"), caplog)
+    said, left = begun(load(override, file="program.yaml"), caplog)
     assert words in said
     assert left == (TWO if "one" in override else [])
 
@@ -208,46 +217,49 @@ def test_a_key_that_has_another_value(load, override, words, caplog):
 def test_another_version_of_a_package(load, monkeypatch, caplog):
     run(load())
     monkeypatch.setattr("importlib.metadata.version", lambda _: "99.0")
-    said, _ = renewed(load(), caplog)
+    said, _ = begun(load(), caplog)
     assert re.search(r"the version of fake_odometry changed from .* to 99\.0", said)
 
 
-def test_of_sequences_that_are_not_trained_on_only_the_odometry_counts(load, tmp_path, caplog):
+def test_of_sequences_that_are_not_trained_on_only_the_odometry_counts(load, tmp_path):
     run(load())
     replace_bag(tmp_path / "two.bag")
-    assert renewed(load("training=[one]"), caplog) == ("", ONE + TWO)
-    other = load("training=[one]", "odometry.settings.downsampling=0.7")
-    assert renewed(other, caplog)[1] == []
+    load().archive().trial_path("one", 1).unlink()
+    assert [*load("training=[one]").archive().known()] == [0, 1]
+    assert not load("training=[one]", "odometry.settings.downsampling=0.7").archive().known()
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "\xff", '{"digest": "", "inputs": {}}'])
 def test_a_damaged_record_is_named(load, text):
     run(load())
-    (load().folder / "trials/two/inputs.json").write_text(text, encoding="latin-1")
-    with pytest.raises(ConfigurationError, match=r"two/inputs\.json: is damaged .*; remove .*two "):
-        load().archive().renew(["one", "two"])
+    path = load().archive().of("two") / "inputs.json"
+    path.write_text(text, encoding="latin-1")
+    what = r"two-\w+/inputs\.json: is damaged .*; remove .*two-\w+ "
+    with pytest.raises(ConfigurationError, match=what):
+        load().archive().begin()
 
 
 def test_a_descriptor_that_was_edited_describes_again(load, tmp_path, caplog):
     _, module = mine(tmp_path)
     overrides = [f"descriptor=[ndt, '{module.stem}:describe']"]
     run(load(*overrides))
+    assert load(*overrides).archive().has_frames("one", [])
     module.write_text(CLASS.replace("{number}", "2"))
-    said, left = renewed(load(*overrides), caplog)
-    assert said == f"2 sequences are described again: module {module.stem} has other content"
+    assert not load(*overrides).archive().has_frames("one", [])
+    said, left = begun(load(*overrides), caplog)
+    assert said == f"since the last run: module {module.stem} has other content"
     assert left == ONE + TWO
-    assert not any("frames" in name for name in files(load()))
 
 
 def test_what_changes_while_it_is_read_is_not_recorded(load, tmp_path):
     study = load()
     archive = study.archive()
-    archive.renew(study.training)
+    archive.begin()
     poses = tmp_path / "one.tum"
     poses.write_text(poses.read_text().replace(" 0.3", " 0.4", 1) + "\n")
     with pytest.raises(ConfigurationError, match=r"one\.tum: has changed while one was read"):
         archive.write("one", 0, trial({"a": 0}))
-    assert not (study.folder / "trials/one/inputs.json").exists()
+    assert not list(study.folder.glob("trials/one-*"))
     archive.write("two", 0, trial({"a": 0}))
     load().archive().write("one", 0, trial({"a": 0}))
 
@@ -258,6 +270,7 @@ def test_trials_with_faults_depend_on_the_limits(load, tmp_path, caplog):
     for number, faults in ((0, ()), (1, ("late",))):
         archive.write("one", number, replace(trial({"x": number}), faults=faults))
     archive.write("two", 0, trial({"x": 0}))
-    said, left = renewed(load(*overrides, "isolation.seconds=20"), caplog)
+    said, left = begun(load(*overrides, "isolation.seconds=20"), caplog)
     assert re.fullmatch(r"1 trials are run again: limits\.seconds changed from .* to 20\.0", said)
     assert left == ["one/00000", "two/00000"]
+    assert begun(load(*overrides), caplog)[1] == ["one/00000", "one/00001", "two/00000"]

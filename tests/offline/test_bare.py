@@ -64,7 +64,7 @@ def test_what_needs_the_health_check_more_than_the_baseline_is_not_recommended(h
 def test_bare_drives_are_those_of_helped_sets_and_of_the_baseline(helped):
     study, _ = helped
     archive = Archive(study.folder / "trials")
-    found = {int(path.name[:5]) for path in archive.folder.glob("one/*-bare.npz")}
+    found = {int(path.name[:5]) for path in archive.folder.glob("one-*/*-bare.npz")}
     assert 0 in found
     helped_sets = {n for n, run in archive.finished("one").items() if run.restarts}
     assert found <= helped_sets

@@ -114,7 +114,7 @@ def test_validates_a_study(study_file, trained_folder, tmp_path):
     ):
         with pytest.raises(AdaptuneError, match=text):
             validate(load_study(study_file, [other], study.folder))
-    archive = study.folder / "trials/one"
+    archive = study.archive().of("one")
     (archive / "00003.npz").rename(archive / "gone")
     with pytest.raises(ModelError, match=r"lacks trial 3 on one.*adaptune offline"):
         validate(study)

@@ -6,11 +6,12 @@ import pytest
 from commands import succeeded
 
 from adaptune.archive import Archive
-from adaptune.metrics import cap
+from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.study.oracle import oracle_errors
+from adaptune.progress import unseen
 from offline.config import load_study
 from offline.train import odometry_rows, oracle_sets, run_oracle, train
+from online.modes import Replays, replay_modes
 
 N = 5
 
@@ -35,16 +36,38 @@ def test_errors_on_test_sequences_are_read(oracle):
     study, done = oracle
     model = ErrorModel.load(study.model_path)
     archive = study.archive("oracle")
-    found = oracle_errors(archive, "three", model)
-    assert set(found.trials) == set(oracle_sets(model, N))
-    assert found.trials[0] == model.fixed
-    assert found.errors.shape == (40, N)
+    found = archive.errors_of("three", model.sets)
+    assert found.keys() == set(oracle_sets(model, N))
+    errors = np.stack([*found.values()], axis=1)
+    assert errors.shape == (40, N)
     # The last sub-trajectory of 3 m begins ten scans before the end.
-    assert np.isfinite(found.errors[:29]).all()
-    assert np.isnan(found.errors[31:]).all()
-    least = np.nanmean(cap(found.errors), axis=0).min()
+    assert np.isfinite(errors[:29]).all()
+    assert np.isnan(errors[31:]).all()
+    least = np.nanmean(cap(errors), axis=0).min()
     assert f"{least:.3f}" in done.stdout
-    assert oracle_errors(archive, "one", model) is None
+    assert archive.errors_of("one", model.sets) == {}
+
+
+def test_a_trial_and_a_replay_of_a_set_are_one_run(oracle):
+    """Where a trial drives the whole recording, and nothing is restarted at the reference."""
+    study, _ = oracle
+    model, archive = ErrorModel.load(study.model_path), study.archive("oracle")
+    replay_modes(study, ["three"], ["baseline", "fixed"], unseen, model)
+    assert archive.is_uncut("three")
+    T_ref_sensor, replays = archive.read_frames("three").counted, Replays(study, model)
+    for mode, number in (("baseline", 0), ("fixed", model.fixed)):
+        trial, replay = archive.read("three", number), replays.read("three", mode)
+        # As the digits of a TUM file and of single precision say.
+        np.testing.assert_allclose(
+            replay.trajectory.T_world_sensor, trial.T_odom_sensor, rtol=0, atol=1e-8
+        )
+        # A replay's own reference has the digits of a file, too: here, where scans are just 0.3 m
+        # apart and sub-trajectories 3 m long, some of those end one scan later by it.
+        driven = replay.trajectory.T_world_sensor
+        errors = sub_trajectory_rte(T_ref_sensor, driven, study.config.sub_trajectory)
+        assert np.isfinite(errors).sum() > 20
+        np.testing.assert_allclose(errors, trial.errors, rtol=1e-5, atol=1e-6)
+        assert replay.restarted.tolist() == trial.restarted.astype(bool).tolist()
 
 
 def test_nothing_learns_from_it(oracle, study_file, trained_folder):
@@ -72,12 +95,12 @@ def test_it_resumes_and_renews_what_has_changed(load, caplog):
     assert [now[n] == made.get(n) for n in files] == [n in made and n != removed for n in files]
     # The same recording seen in another way.
     other = load("sequences.three.stop=3")
-    assert oracle_errors(other.archive("oracle"), "three", model) is None
-    assert "of other inputs: sequences.three.stop is new; run `adaptune online" in caplog.text
+    assert other.archive("oracle").errors_of("three", model.sets) == {}
     (row,) = run_oracle(other, 2)
+    assert "4 trials are run again: sequences.three.stop is new" in caplog.text
     assert row["sets"] == 2
-    assert len(oracle_errors(other.archive("oracle"), "three", model).errors) < 40
-    assert not files[oracle_sets(model, 4)[3]].exists()
+    assert len(other.archive("oracle").errors_of("three", model.sets)[model.fixed]) < 40
+    assert all(path.exists() for path in files.values())
 
 
 def test_each_of_several_odometries_is_run_on_the_test(study_file, tmp_path):

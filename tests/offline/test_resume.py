@@ -10,6 +10,7 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.train import train
 
@@ -48,7 +49,7 @@ def trained(finished, tmp_path):
 
 
 def test_frames_that_are_damaged_or_removed_are_made_again(trained):
-    frames = trained.folder / "trials/one/frames.npz"
+    frames = trained.archive().of("one") / "frames.npz"
     before = timeless(frames)
     frames.write_bytes(frames.read_bytes()[:100])
     train(trained)
@@ -78,7 +79,8 @@ def test_only_what_depends_on_another_recording_is_computed_again(trained, tmp_p
     found = train(study).model
     assert re.search(r"4 trials are run again: .*one\.bag has other content", caplog.text)
     after = mtimes(trials)
-    assert {path.parts[0] for path in written if after[path] != written[path]} == {"one"}
+    assert written.items() <= after.items()
+    assert {path.parts[0].partition("-")[0] for path in after.keys() - written} == {"one"}
     assert found.sets.parameters == before.sets.parameters
     of_one, of_two = found.sequence == 0, found.sequence == 1
     assert not np.array_equal(found.errors[of_one], before.errors[before.sequence == 0])
@@ -95,6 +97,18 @@ def test_with_nothing_to_do_nothing_is_done(trained):
     train(trained)
     assert trained.model_path.read_bytes() == before
     assert len(first.trials) == 4
+
+
+@pytest.mark.parametrize("file", ["trials/one/inputs.json", "replays/three/reference.inputs.json"])
+def test_a_folder_of_an_older_version_stays_as_it_is(study_file, tmp_path, file):
+    path = tmp_path / "run" / file
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    with pytest.raises(
+        ConfigurationError, match=r"run: its trials .* run again with another --fol"
+    ):
+        load_study(study_file, [], tmp_path / "run")
+    assert path.exists()
 
 
 @pytest.mark.usefixtures("study")

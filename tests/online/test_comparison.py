@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import drives
 import numpy as np
 import pytest
+from made_replays import folder_of
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
@@ -21,8 +22,7 @@ from offline.config import load_study
 from online.compare import NONE, compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
-from online.reference import read_reference
-from online.replayed import read_replays
+from online.reference import read_reference, reference_folder
 from online.statistics import ComparisonRow
 from online.verdict import remarks
 
@@ -135,14 +135,13 @@ def test_rows_and_files(replayed):
 
 def test_baseline_and_fixed_keep_their_parameters(replayed):
     model = ErrorModel.load(replayed.folder / "model.safetensors")
-    folder = replayed.folder / "replays/three"
-    about = {m: json.loads((folder / m / "inputs.json").read_text())["inputs"] for m in MODES}
+    about = {m: manifest.recorded(folder_of(replayed, m) / manifest.FILE) for m in MODES}
     assert about["baseline"]["parameters"] == replayed.odometry.space.baseline
     assert about["fixed"]["parameters"] == model.sets[model.fixed]
 
 
 def test_values_that_stay_read_as_those_that_change(own):
-    path = own.folder / "replays/three/fixed" / manifest.FILE
+    path = folder_of(own, "fixed") / manifest.FILE
     parameters = {"mode": True, "size": 3, "kernel": "none"}
     manifest.record(path, manifest.recorded(path) | {"parameters": parameters})
     choices = StoredReplay.read(path.parent).choices
@@ -154,17 +153,18 @@ def test_one_set_is_driven_where_there_is_no_bank(own, study_file):
     given = ["online.switching.mechanism=live"]
     path = own.folder / "alone.safetensors"
     model.save(path)
-    study = load_study(
-        study_file, [*given, "online.period=0.5", "online.modes=[standby, paper]"], own.folder
+    study = replace(
+        load_study(
+            study_file, [*given, "online.period=0.5", "online.modes=[standby, paper]"], own.folder
+        ),
+        model_file=path,
     )
-    assert run_replays(study, path) == 4
+    assert run_replays(study, path) == 2  # of the others, those before are the same
     row = next(row for row in compare(study).rows if row.mode == "standby")
     assert row.rte < 3.0
-    folder = study.folder / "replays/three/standby"
+    folder = folder_of(study, "standby")
     about = {
-        mode: json.loads((folder.with_name(mode) / "inputs.json").read_text())["inputs"][
-            "switching"
-        ]
+        mode: manifest.recorded(folder_of(study, mode) / manifest.FILE)["switching"]
         for mode in ("standby", "paper")
     }
     # Also the paper's rule has one instance, and all sets to choose from.
@@ -187,9 +187,9 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     path = own.folder / "paying.safetensors"
     paying.save(path)
     study = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
+    study = replace(study, model_file=path)
     run_replays(study, path)
-    folder = study.folder / "replays/three"
-    with (folder / "adaptive/selections.csv").open() as file:
+    with (folder_of(study, "adaptive") / "selections.csv").open() as file:
         for row in csv.DictReader(file):
             pairs = [pair.split(":") for pair in row["weights"].split()]
             weights = {int(trial): float(weight) for trial, weight in pairs}
@@ -198,7 +198,7 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
             assert sum(weights.values()) == pytest.approx(1.0, abs=0.002)
             assert int(row["trial"]) == model.fixed
     # The published rule has all sets to choose from.
-    with (folder / "paper/selections.csv").open() as file:
+    with (folder_of(study, "paper") / "selections.csv").open() as file:
         assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.sets)
     assert next(row.rte for row in compare(study).rows if row.mode == "adaptive") < 3.0
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
@@ -210,8 +210,7 @@ def test_replays_are_made_once(replayed, study_file):
     model = replayed.folder / "model.safetensors"
     assert run_replays(replayed, model) == 0
     cut = load_study(study_file, ["online.period=2"], replayed.folder)
-    # Baseline and fixed replays hold no selections, but their records name the period.
-    assert run_replays(cut, model) == 4
+    assert run_replays(cut, model) == 2  # nothing is selected in the others
     # The earlier ones have been kept.
     assert run_replays(replayed, model) == 0
 
@@ -221,13 +220,13 @@ def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_
     run_replays(study, trained.folder / "model.safetensors")
     rows = compare(study).rows
     assert [row.rte for row in rows] == [None] * 4
-    assert not (study.folder / "replays/three/reference.tum").exists()
+    assert not (reference_folder(study, "three") / "reference.tum").exists()
     run_replays(trained, trained.folder / "model.safetensors")
     assert compare(trained).rows[0].rte is not None
 
 
 def test_a_written_reference_is_that_of_the_scans(replayed):
-    reference = read_tum(replayed.folder / "replays/three/reference.tum")
+    reference = read_tum(reference_folder(replayed, "three") / "reference.tum")
     np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.3 * np.arange(40), atol=1e-9)
 
 
@@ -240,23 +239,11 @@ def test_frames_in_a_gap_of_the_reference_have_no_error(own, study_file, tmp_pat
         given = [f"reference={tmp_path}/gap.tum", f"max_gap={max_gap}"]
         study = load_study(study_file, [f"sequences.three.{one}" for one in given], own.folder)
         run_replays(study, study.model_path)
-        stamps = StoredReplay.read(own.folder / "replays/three/fixed").trajectory.stamps
+        stamps = StoredReplay.read(folder_of(own, "fixed")).trajectory.stamps
         in_training = np.isnan(study.sequences.open("three").reference().at(stamps)[:, 0, 0])
         assert np.count_nonzero(in_training) == unknown
         compared = np.isnan(read_reference(study, "three").trajectory.at(stamps)[:, 0, 0])
         np.testing.assert_array_equal(compared, in_training)
-
-
-def test_replays_of_an_older_commit_are_made_again(own):
-    for path in own.folder.glob("replays/three/*/inputs.json"):
-        path.unlink()
-    what = r"three/\w+: an older adaptune did not record what .*; run `adaptune online` again"
-    for read in (compare, lambda study: read_replays(study, "three")):
-        with pytest.raises(StoredReplayError, match=what):
-            read(own)
-    assert run_replays(own, own.model_path) == len(MODES)
-    assert len(compare(own).rows) == len(MODES)
-    assert len(list(own.folder.glob("earlier/*/replays/three/*/replay.json"))) >= 1
 
 
 def test_rows_over_several_sequences(replayed, study_file, tmp_path):
@@ -311,12 +298,13 @@ def test_refuses_a_model_of_something_else(trained, study_file, tmp_path, overri
     ],
 )
 def test_a_damaged_replay_is_named(replayed, file, text):
-    path = replayed.folder / "replays/three/adaptive" / file
+    path = folder_of(replayed, "adaptive") / file
     before = path.read_text()
     path.write_text(text)
     try:
         what = (
-            rf"{file}: is damaged .*; remove .*adaptive and run `adaptune online` with this study"
+            rf"{file}: is damaged .*; remove .*adaptive-\w+ and run `adaptune online` with this "
+            rf"study"
         )
         with pytest.raises(StoredReplayError, match=what) as caught:
             compare(replayed)
@@ -346,7 +334,7 @@ def test_restarts_are_told_with_their_reason():
 
 
 def test_restarts_are_those_of_the_stored_replay(own):
-    folder = own.folder / "replays/three/adaptive"
+    folder = folder_of(own, "adaptive")
     lines = (folder / "frames.csv").read_text().splitlines()
     head = lines[0].split(",")
     rows = [dict(zip(head, line.split(","), strict=True)) for line in lines[1:]]

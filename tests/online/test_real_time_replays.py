@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_replays import folder_of
 
 from adaptune import manifest
 from adaptune.model import BankSettings, ErrorModel
 from offline.config import load_study
 from online.compare import compare
 from online.modes import run_replays
-from online.record import StoredReplay, StoredReplayError
+from online.record import StoredReplay
 from online.verdict import remarks
 
 RATE = "online.real_time.rate=5"
@@ -37,49 +38,52 @@ def study(study_file, trained_folder, tmp_path_factory):
 
 
 def summary(study, mode):
-    return json.loads((study.folder / f"replays/three/{mode}/replay.json").read_text())
+    return json.loads((folder_of(study, mode) / "replay.json").read_text())
 
 
 def test_it_is_recorded_how_a_replay_kept_up(study):
     for mode in ("baseline", "fixed", "adaptive"):
         found = summary(study, mode)
         kept = found["real_time"]
-        inputs = manifest.recorded(study.folder / f"replays/three/{mode}" / manifest.FILE)
+        inputs = manifest.recorded(folder_of(study, mode) / manifest.FILE)
         assert inputs["real_time"] == {"rate": 5.0, "deadline": 60.0, "queue": 0}
         assert (kept["rate"], kept["dropped_scans"], kept["missed_selections"]) == (5.0, 0, 0)
         assert 0.0 < kept["pose_ms_p50"] <= kept["pose_ms_p99"]
         assert (kept["selection_ms_p50"] > 0.0) == (mode == "adaptive")
-        with (study.folder / f"replays/three/{mode}/frames.csv").open() as file:
+        with (folder_of(study, mode) / "frames.csv").open() as file:
             late = [float(row["late_ms"]) for row in csv.DictReader(file)]
         assert np.percentile(late, 50) == pytest.approx(kept["pose_ms_p50"], abs=0.01)
 
 
 def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
-    in_real_time = StoredReplay.read(study.folder / "replays/three/adaptive")
+    in_real_time = StoredReplay.read(folder_of(study, "adaptive"))
     overrides = ["online.modes=[adaptive]", BANK]
     lockstep = load_study(study_file, overrides, study.folder.parent / "lockstep")
     shutil.copytree(study.folder, lockstep.folder)
     assert run_replays(lockstep, lockstep.model_path) == 3  # those in real time are others
-    found = StoredReplay.read(lockstep.folder / "replays/three/adaptive")
+    found = StoredReplay.read(folder_of(lockstep, "adaptive"))
     np.testing.assert_allclose(
         in_real_time.trajectory.T_world_sensor, found.trajectory.T_world_sensor, atol=1e-9
     )
     assert list(in_real_time.choice_stamps) == list(found.choice_stamps)
     np.testing.assert_allclose(in_real_time.estimated, found.estimated, atol=1e-9)
     assert found.summary.real_time is None
-    mixed = lockstep.folder / "replays/three/adaptive"
-    shutil.copytree(study.folder / "replays/three/adaptive", mixed, dirs_exist_ok=True)
-    with pytest.raises(StoredReplayError, match="some were made in real time"):
-        compare(lockstep)
+    # Both are there, and each is compared with its own.
+    for one, pace in ((lockstep, None), (study, {5.0})):
+        of_rows = [row.real_time for row in compare(one).rows]
+        assert (
+            all(of is None for of in of_rows)
+            if pace is None
+            else {r["rate"] for r in of_rows} == pace
+        )
 
 
-def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
-    """Also by a study that does not say that they were, and where scans were dropped."""
-    asks = load_study(study_file, ["online.modes=[adaptive]", BANK], study.folder)
-    said = remarks(compare(asks).rows)
+def test_replays_in_real_time_are_compared_as_they_are(study):
+    """Also where scans were dropped."""
+    said = remarks(compare(study).rows)
     (told,) = (text for text in said if text.startswith("Replayed at 5 times the recorded rate,"))
     assert "nothing came too late: 99 % of the poses came within " in told
-    fixed = study.folder / "replays/three/fixed"
+    fixed = folder_of(study, "fixed")
     said = json.loads((fixed / "replay.json").read_text())
     said["real_time"] |= {"dropped_scans": 1, "missed_selections": 2}
     (fixed / "replay.json").write_text(json.dumps(said))
@@ -87,7 +91,7 @@ def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
         lines = (fixed / name).read_text().splitlines(keepends=True)
         # One of the last twenty scans.
         (fixed / name).write_text("".join(lines[:-20] + lines[-19:]))
-    rows = compare(asks).rows
+    rows = compare(study).rows
     assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive"]
     assert {row.real_time["rate"] for row in rows} == {5.0}
     (found,) = [text for text in remarks(rows) if "too late" in text]

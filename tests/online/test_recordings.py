@@ -9,16 +9,19 @@ import drives
 import numpy as np
 import pytest
 from commands import call, refused, succeeded
+from made_replays import folder_of
 from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert
+from adaptune.model import BankSettings
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
-from online.record import StoredReplay, StoredReplayError, write_replay
+from online.modes import Replays
+from online.record import StoredReplayError, write_replay
 from online.recordings import record_replays, topic
-from online.reference import write_reference
+from online.reference import reference_folder, write_reference
 from online.replay import Choice, ReplayRecord
 
 N = 40
@@ -66,24 +69,25 @@ def selections():
 @pytest.fixture
 def study(study_file, tmp_path, monkeypatch):
     """A study with replays that were made up, of parameters that its odometry does not have."""
-    monkeypatch.setattr("online.record.load_space", lambda _: SimpleNamespace(names=tuple(FIXED)))
     study = load_study(study_file, [], tmp_path / "run")
-    folder = study.folder / "replays/three"
-    shared = study.replay_inputs("three")
+    # Of a model, there is only one here.
+    about = {"fixed": 1, "sets": {0: {}, 1: FIXED}, "bank": [1, 0], "recommended": "fixed"}
+    about |= {"digest": "x", "bank_size": 9, "bank_settings": BankSettings(), "costs": None}
+    model = SimpleNamespace(**about)
+    monkeypatch.setattr("online.recordings.Replays.of", lambda study: Replays(study, model))
+    replays = Replays(study, model)
     in_time = {"rate": 1.0, "late": [0.02] * N}
-    for mode, made, kept in (
-        ("baseline", replay_of(along_x(0.02)), study.odometry.space.baseline),
-        ("fixed", replay_of(along_x(0.01)), FIXED),
-        ("adaptive", replay_of(along_x(0.005), list(selections()), **in_time), None),
+    for mode, made in (
+        ("baseline", replay_of(along_x(0.02))),
+        ("fixed", replay_of(along_x(0.01))),
+        ("adaptive", replay_of(along_x(0.005), list(selections()), **in_time)),
     ):
-        about = {"mode": mode, "parameters": kept, "model": None, "switching": None} | shared
-        write_replay(folder / mode, made, about, None)
+        write_replay(replays.folder("three", mode), made, replays.inputs("three", mode))
     elsewhere = np.eye(4)
     elsewhere[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     elsewhere[:3, 3] = 5.0, -3.0, 1.0
     reference = Trajectory(STAMPS, elsewhere @ along_x().T_world_sensor)
-    poses = study.sequences.reference("three")
-    write_reference(folder, reference, along_x(), poses)
+    write_reference(reference_folder(study, "three"), reference, along_x())
     return study
 
 
@@ -229,19 +233,11 @@ def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_pat
         assert re.search(said, refused("record", study_file, *names, "--folder", folder))
 
 
-def test_replays_of_something_else_are_refused(study, study_file):
-    other = load_study(study_file, ["sequences.three.stop=2"], study.folder)
-    with pytest.raises(StoredReplayError, match=r"from other inputs: .*sequences\.three.*; run"):
-        record_replays(other, "three")
+def test_a_reference_of_something_else_and_a_damaged_replay_are_refused(study, study_file):
     other = load_study(study_file, ["sequences.three.reference=none"], study.folder)
     with pytest.raises(StoredReplayError, match="was judged by another reference; run"):
         record_replays(other, "three")
-    path = study.folder / "replays/three/adaptive/selections.csv"
-    # A column of another version is none of the parameters, wherever it stands.
-    before = StoredReplay.read(path.parent).choices
-    header, *rows = path.read_text().splitlines()
-    path.write_text("\n".join([f"scans,{header},more", *(f"7,{row},x" for row in rows)]) + "\n")
-    assert StoredReplay.read(path.parent).choices == before
+    path = folder_of(study, "adaptive") / "selections.csv"
     path.write_text(path.read_text().replace("0.7000", "many"))
     with pytest.raises(StoredReplayError, match=r"selections\.csv: is damaged"):
         record_replays(study, "three")
@@ -253,16 +249,15 @@ def positions(path):
 
 
 def test_all_begin_where_they_first_overlap_the_reference(study):
-    folder = study.folder / "replays/three"
-    truth = along_x()
+    folder, truth = reference_folder(study, "three"), along_x()
     late = Trajectory(STAMPS[10:], truth.T_world_sensor[10:])
-    write_reference(folder, late, truth, study.sequences.reference("three"))
+    write_reference(folder, late, truth)
     found = messages(record_replays(study, "three").parent)
     np.testing.assert_allclose(positions(found["/reference/path"])[0], 0.0, atol=1e-9)
     own = along_x(0.02).T_world_sensor
     placed = (invert(own[10]) @ own)[:, :2, 3]
     np.testing.assert_allclose(positions(found["/baseline/path"]), placed, atol=1e-8)
-    write_reference(folder, None, truth, study.sequences.reference("three"))
+    (folder / "reference.tum").unlink()
     without = messages(record_replays(study, "three").parent)
     assert not {"/reference/path", "/baseline/true_error"} & set(without)
     np.testing.assert_allclose(positions(without["/fixed/path"])[0], 0.0, atol=1e-9)

@@ -2,7 +2,6 @@ import csv
 import json
 import math
 import time
-from pathlib import Path
 
 import drives
 import numpy as np
@@ -60,7 +59,6 @@ class Cautious(HealthCheck):
 
 
 HEALTH = Cautious(max_speed=5.0)
-MODEL = Path("model.safetensors")
 ABOUT = {"mode": "x", "parameters": None, "model": None, "real_time": None}
 
 
@@ -154,7 +152,7 @@ def test_too_many_scans_that_do_not_register_restart(tmp_path, monkeypatch):
     result = replay(scans(np.arange(11) / 10), InProcess(odometry), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [5, 8]
     assert result.unhealthy == {"max_unregistered": 2}
-    write_replay(tmp_path, result, ABOUT, MODEL)
+    write_replay(tmp_path, result, ABOUT)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["unhealthy"] == {"max_unregistered": 2}
     assert summary["poor_scans"] == sum(not step.registered for step in result.steps) == 7
@@ -182,10 +180,9 @@ def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, cap
         "a, adaptive: the odometry goes on at 2.0 s",
         "a, adaptive: the odometry is lost at 3.0 s",
     ]
-    write_replay(tmp_path, result, ABOUT, None)
+    write_replay(tmp_path, result, ABOUT)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["lost_seconds"] == 2.5  # the last selection holds until the end
-    assert summary["model_file"] is None
 
 
 def test_no_scans():
@@ -205,7 +202,7 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
     a, b = (r.trajectory.T_world_sensor for r in results)
     np.testing.assert_array_equal(a, b)
     assert abs(a[-1, 0, 3] - 24 * 0.3) < 0.1
-    write_replay(tmp_path, results[0], ABOUT, MODEL)
+    write_replay(tmp_path, results[0], ABOUT)
     written = read_tum(tmp_path / "trajectory.tum")
     np.testing.assert_array_equal(written.stamps, [stamp for stamp, _, _ in drives.scans(0, 25)])
     np.testing.assert_allclose(written.T_world_sensor, a, atol=1e-8)
@@ -237,7 +234,7 @@ def test_what_a_replay_costs_is_measured_without_reading(tmp_path):
     # Half a second in other processes, for twenty scans.
     assert 27.0 < other.cpu_ms < 40.0
     assert other.memory > 1000.0
-    write_replay(tmp_path, other, ABOUT, None)
+    write_replay(tmp_path, other, ABOUT)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["cpu_ms"] == round(other.cpu_ms, 3)
     assert summary["memory_mb"] == round(other.memory, 1)
@@ -258,7 +255,7 @@ def test_selections_of_several_odometries_are_stored_with_gaps(tmp_path):
             """Take it as it is."""
 
     result = replay(scans(np.arange(21) / 10), Any(Scripted()), HEALTH, Chooser(sets))
-    write_replay(tmp_path, result, ABOUT, None)
+    write_replay(tmp_path, result, ABOUT)
     choices = StoredReplay.read(tmp_path).choices
     assert choices["odometry"] == ["b", "a", "b"]
     np.testing.assert_array_equal(choices["speed"], [np.nan, 1.0, np.nan])
@@ -504,9 +501,9 @@ def test_a_late_first_pose_is_told_and_what_was_before_is_left_out(tmp_path, cap
     caplog.set_level("INFO")
     late = replay(scans(np.arange(40.0)), LateToPose(Scripted()), HEALTH)
     assert late.first_pose == 3.0
-    folder = tmp_path / "hall" / "fixed"
+    folder = tmp_path / "hall" / "fixed-0"
     folder.mkdir(parents=True)
-    write_replay(folder, late, ABOUT, MODEL)
+    write_replay(folder, late, ABOUT)
     assert caplog.messages == ["hall, fixed: the odometry gave its first pose after 3.0 s"]
     stored = StoredReplay.read(folder)
     assert stored.summary.first_pose == 3.0

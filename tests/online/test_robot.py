@@ -76,9 +76,9 @@ def drive(study, mode, played, n, model=True):
 def test_it_drives_as_a_replay_in_lockstep(make, mode):
     study = make()
     found, link, _ = drive(study, mode, clouds(), len(SCANS), model=mode != "untrained")
-    setup = ReplaySetup.of(study)
     model = None if mode == "untrained" else ErrorModel.load(study.model_path)
-    made = setup.mode(mode, model)
+    setup = ReplaySetup.of(study, model)
+    made = setup.mode(mode)
     odometry, selector = setup.instance(made), made.selector and made.selector()
     scans = [Scan(stamp, points) for stamp, points, _ in SCANS]
     expected = replay(scans, odometry, study.config.health, selector)

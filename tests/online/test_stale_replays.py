@@ -1,25 +1,26 @@
 """Replays and models whose recordings, odometry or reference have changed since they were made."""
 
-import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from made_replays import folder_of
 from small_bag import replace_bag
 
-from adaptune import manifest
 from adaptune.errors import AdaptuneError
-from adaptune.model import ErrorModel
+from adaptune.model import BankSettings, ErrorModel
+from adaptune.progress import unseen
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
 from online.charts import charts_of_replays
-from online.compare import compare, current_replays
-from online.modes import run_replays
+from online.compare import compare
+from online.modes import Replays, replay_modes, run_replays
 from online.record import StoredReplayError
-from online.reference import check_reference
+from online.reference import CONTRADICTIONS, reference_folder
 from online.replayed import read_replays
 
 
@@ -52,37 +53,30 @@ def run(study, **given):
 def load(replayed, tmp_path, caplog):
     caplog.set_level("INFO")
     folder = shutil.copytree(replayed, tmp_path / "copy")
-    for path in folder.glob("run/replays/*/*/replay.json"):
-        path.write_text(path.read_text().replace(str(replayed), str(folder)))
     return lambda *overrides: load_at(folder, *overrides)
-
-
-def rewrite(folder, **inputs):
-    """Change what a replay was made from."""
-    path = folder / manifest.FILE
-    manifest.record(path, manifest.recorded(path) | inputs)
 
 
 def test_a_test_recording_that_was_replaced(load, caplog):
     study = load()
     assert run(study) == 0
     compare(study)
-    replace_bag(study.folder.parent / "three.bag")
+    bag = study.folder.parent / "three.bag"
+    before = bag.read_bytes()
+    replace_bag(bag)
     with pytest.raises(StoredReplayError, match=r"three\.bag has other content; run `adaptune on"):
         compare(study)
-    # All that is refused for one reason is told at once.
-    (said,) = charts_of_replays(read_replays(study, "three"))
-    assert said == (
-        f"{study.folder / 'replays/three'}: baseline, fixed, adaptive were made from other "
-        f"inputs: {study.folder.parent / 'three.bag'} has other content; run `adaptune online` "
-        f"with this study."
-    )
+    assert read_replays(study, "three").modes == {}
     assert run(study) == 3
+    assert "three, adaptive: replayed again: " in caplog.text
     assert "three.bag has other content" in caplog.text
+    compare(study)
+    # Nothing is lost: each has a folder of its own.
+    bag.write_bytes(before)
+    assert run(study) == 0
     compare(study)
 
 
-def test_another_reference_replays_nothing(load, caplog):
+def test_another_reference_replays_nothing(load):
     study = load()
     before = {row.mode: row.rte for row in compare(study).rows}
     path = study.folder.parent / "three.tum"
@@ -93,7 +87,6 @@ def test_another_reference_replays_nothing(load, caplog):
     with pytest.raises(StoredReplayError, match=r"three: was judged by another reference; run"):
         compare(study)
     assert run(study) == 0
-    assert "three: the reference has changed; no replay depends on it" in caplog.text
     after = {row.mode: row.rte for row in compare(study).rows}
     assert all(abs(after[mode] - before[mode]) > 1.0 for mode in before)
     shifted = load("sequences.three.clock_offset=0.05")
@@ -137,75 +130,41 @@ def test_a_model_of_other_training_sequences(load):
         run_replays(fewer, Path(os.path.relpath(fewer.model_path)))
 
 
-def test_replays_with_two_models_are_not_compared(load):
+def test_replays_with_another_model_are_others(load, caplog):
     study = load()
-    path = study.folder / "replays/three/adaptive/replay.json"
-    stored = json.loads(path.read_text()) | {"model_file": "/gone/model.safetensors"}
-    path.write_text(json.dumps(stored))
-    rewrite(path.parent, model="another")
-    # Only one mode is adaptive here: it is of a model that is gone, and nothing else is known.
-    compare(study)
-    twice = study.folder / "replays/three/paper"
-    shutil.copytree(path.parent, twice)
-    rewrite(twice, mode="paper", model="a third")
-    both = load("online.modes=[adaptive, paper]")
-    with pytest.raises(StoredReplayError, match=r"model changed from another to .*; run `adaptune"):
-        compare(both)
-    both.model_path.unlink()
-    with pytest.raises(StoredReplayError, match=r"different models .*run `adaptune online` again"):
-        compare(both)
-
-
-def test_what_is_refused_is_told_and_not_drawn(load):
-    study = load()
-    assert current_replays(study, ["three"])[1:] == (("baseline", "fixed", "adaptive"), ())
-    assert current_replays(study, ["one"])[1:] == ((), ())
-    # What is left of a mode that the study does not have any more is not looked at.
-    folder = study.folder / "replays/three"
-    shutil.copytree(folder / "adaptive", folder / "paper")
-    assert "paper" not in current_replays(study, ["three"]).modes
-    other = load("online.switching.mechanism=bank", "online.switching.size=2")
-    _, modes, refused = current_replays(other, ["three"])
-    assert modes == ("baseline", "fixed")
-    with pytest.raises(StoredReplayError, match="made from other inputs: switching") as caught:
+    path = study.folder / "other.safetensors"
+    settings = BankSettings(sharpness=7.0)
+    replace(ErrorModel.load(study.model_path), bank_settings=settings).save(path)
+    assert run_replays(study, path) == 1  # that which adapts
+    other = replace(study, model_file=path)
+    assert folder_of(other, "adaptive") != folder_of(study, "adaptive")
+    assert folder_of(other, "fixed") == folder_of(study, "fixed")
+    for one in (study, other):
+        assert [row.mode for row in compare(one).rows] == ["baseline", "fixed", "adaptive"]
+    shutil.rmtree(folder_of(study, "adaptive"))
+    caplog.clear()
+    assert [row.mode for row in compare(study).rows] == ["baseline", "fixed"]
+    said = "three: the last replay of `adaptive` was made from other inputs: model changed from "
+    assert said in caplog.text
+    path.unlink()
+    with pytest.raises(AdaptuneError, match=r"other\.safetensors"):
         compare(other)
-    assert refused == (f"{caught.value}.",)
-    said, of_errors, _ = charts_of_replays(read_replays(other, "three"))
-    assert said == refused[0]
-    lines = {line.name for panel in of_errors.panels for line in panel.drawn}
-    assert {"baseline", "fixed"} <= lines
-    assert "adaptive" not in lines
-    assert run(other) == 1
-    compare(other)
 
 
-def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load):
-    study = load("online.modes=[adaptive, even]")
-    run(study)
-    rewrite(study.folder / "replays/three/even", model="another")
-    with pytest.raises(StoredReplayError, match="even: was made from other inputs: model changed"):
-        compare(study)
-    _, modes, (said,) = current_replays(study, ["three"])
-    assert modes == ("baseline", "fixed", "adaptive")
-    assert "three/even: was made from other inputs: model changed from another to " in said
-
-
-def test_replays_of_another_rate_or_reference_are_not_drawn(load):
+def test_a_set_is_driven_once_whatever_it_is_called(load):
     study = load()
-    folder = study.folder / "replays/three/adaptive"
-    rewrite(folder, real_time={"rate": 1.0})
-    with pytest.raises(StoredReplayError, match="some were made in real time"):
-        read_replays(study, "three")
-    rewrite(folder, real_time=None)
-    with pytest.raises(StoredReplayError, match="judged by another reference"):
-        read_replays(load("sequences.three.clock_offset=0.05"), "three")
+    shutil.rmtree(study.folder / "replays")
+    own = replace(ErrorModel.load(study.model_path), fixed=0)
+    assert replay_modes(study, ["three"], ["baseline", "fixed"], unseen, own) == 1
+    replays = Replays(study, own)
+    assert replays.made("three") == ("baseline", "fixed")
+    assert replays.folder("three", "fixed") == replays.folder("three", "baseline")
 
 
-@pytest.mark.parametrize("note", ["", "[]", "{}", '{"inputs": {}}'])
-def test_a_damaged_note_of_the_reference_is_no_note(tmp_path, note):
-    (tmp_path / "reference.inputs.json").write_text(note)
-    with pytest.raises(StoredReplayError, match="was judged by another reference; run `adaptune"):
-        check_reference(tmp_path, {})
+def test_another_part_has_no_replays(load):
+    study = load("sequences.three.stop=3")
+    (said,) = charts_of_replays(read_replays(study, "three"))
+    assert said == "No replays of three: run `adaptune online`."
 
 
 def test_a_model_whose_inputs_are_not_known(load):
@@ -217,10 +176,19 @@ def test_a_model_whose_inputs_are_not_known(load):
         run(study)
 
 
+def test_a_reference_that_was_begun_is_made_again(load):
+    study = load()
+    (reference_folder(study, "three") / CONTRADICTIONS).unlink()
+    with pytest.raises(StoredReplayError, match="judged by another reference"):
+        compare(study)
+    assert run(study) == 0
+    compare(study)
+
+
 @pytest.mark.parametrize("file", ["trajectory.tum", "frames.csv"])
 def test_a_file_that_was_removed_is_made_again(load, file):
     study = load()
-    (study.folder / "replays/three/fixed" / file).unlink()
+    (folder_of(study, "fixed") / file).unlink()
     with pytest.raises(StoredReplayError, match=rf"{file}.*; remove .* and run `adaptune online`"):
         compare(study)
     assert run(study) == 1

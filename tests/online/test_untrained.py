@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from commands import refused, succeeded
+from made_replays import folder_of
 
 from adaptune import manifest, yaml12
 from adaptune.odometry.portfolio import read_portfolio
@@ -15,6 +16,7 @@ from offline.config import load_study
 from online.compare import compare
 from online.modes import ReplaySetup, run_untrained, sequences_without_model
 from online.record import StoredReplay, StoredReplayError
+from online.reference import reference_folder
 from online.replayed import read_replays
 from online.tables import tables
 from online.verdict import remarks
@@ -62,13 +64,13 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     assert run_untrained(study) == 2
     assert run_untrained(study) == 0
     assert not study.model_path.exists()
-    folder = study.folder / "replays/three"
-    assert not (folder / "reference.tum").exists()
-    about = manifest.recorded(folder / "untrained" / manifest.FILE)
+    assert not (reference_folder(study, "three") / "reference.tum").exists()
+    folder = folder_of(study, "untrained")
+    about = manifest.recorded(folder / manifest.FILE)
     sets = untrained_sets(study.odometry.space)
     assert about["switching"]["members"] == list(sets.parameters)
     assert about["model"] is None
-    weights = [row["weights"] for row in read(folder / "untrained/selections.csv")]
+    weights = [row["weights"] for row in read(folder / "selections.csv")]
     # Until something is measured.
     assert weights[0] == "0:1.000 1:0.000 2:0.000 3:0.000"
     assert weights[-1] != weights[0]
@@ -110,7 +112,7 @@ def read(path):
 def test_what_a_bank_measures_of_itself_is_kept_and_compared(load):
     study = load()
     run_untrained(study)
-    folder = study.folder / "replays/three/untrained"
+    folder = folder_of(study, "untrained")
     rows = read(folder / "selections.csv")
     assert [row["estimated_error_percent"] for row in rows] == ["nan", "4.0000", "6.0000", "8.0000"]
     assert (rows[2]["estimated_low_percent"], rows[2]["estimated_high_percent"]) == (
@@ -139,9 +141,7 @@ def test_what_a_bank_measures_of_itself_is_kept_and_compared(load):
 def test_other_members_are_replayed_again(load):
     run_untrained(load())
     other = load("online.switching.size=3")
-    with pytest.raises(
-        StoredReplayError, match=r"switching\.members has another value.* --untrained"
-    ):
+    with pytest.raises(StoredReplayError, match=r"untrained was made .*switching\.members has an"):
         compare(other)
     assert run_untrained(other) == 1  # the baseline is the same
 

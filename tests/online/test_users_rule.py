@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import users_rule
+from made_replays import folder_of
 
 from adaptune import manifest
 from adaptune.model import ErrorModel, ModelError
@@ -39,7 +40,7 @@ def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path
     assert found.verdicts[-1].startswith(f"`{mode}`")
 
     run_replays(study, study.model_path)
-    replay = StoredReplay.read(study.folder / "replays/three" / mode)
+    replay = StoredReplay.read(folder_of(study, mode))
     assert np.unique(replay.selections["trial"]).tolist() == [least]
     assert run_replays(study, study.model_path) == 0
 
@@ -55,7 +56,7 @@ def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path
         file.write("# changed\n")
     again = load_study(study_file, ["online.modes=[my_rules:Cheapest]"], study.folder)
     assert run_replays(again, again.model_path) == 1
-    about = manifest.recorded(study.folder / "replays/three" / mode / manifest.FILE)
+    about = manifest.recorded(folder_of(again, mode) / manifest.FILE)
     assert about["rule"]
 
 

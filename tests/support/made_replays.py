@@ -4,6 +4,7 @@ import numpy as np
 
 from adaptune.report.charts import Spans
 from adaptune.space import Categorical, Float, ParameterSpace
+from online.modes import Replays
 from online.replayed import ModeReplay, ReplayedSequence
 
 SECONDS = np.arange(0.0, 20.0, 0.1)
@@ -53,3 +54,8 @@ SPACE = ParameterSpace.of(
 def sequence(**modes):
     """The replays of a sequence by mode."""
     return ReplayedSequence("new", 10.0, modes, SPACE, SCENES)
+
+
+def folder_of(study, mode, name="three"):
+    """Where a replay of a study is, with its own error model."""
+    return Replays.of(study).folder(name, mode)

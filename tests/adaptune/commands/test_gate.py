@@ -96,7 +96,7 @@ def test_recordings_of_several_sensors_compare_and_each_side_is_named_while_it_d
 @pytest.mark.services
 def test_nothing_known_is_driven_again_and_folders_are_sides(bags, caplog):
     gate("bad", "good")
-    replays = sorted((bags / "runs/compare").glob("*/replays/*/baseline/replay.json"))
+    replays = sorted((bags / "runs/compare").glob("*/replays/*/baseline-*/replay.json"))
     times = [path.stat().st_mtime_ns for path in replays]
     caplog.clear()
     with caplog.at_level("INFO"):
@@ -162,7 +162,10 @@ def test_for_the_cost_both_are_driven_twice_by_turns_and_that_is_kept(bags, monk
 def test_what_has_changed_since_has_no_cost():
     gate("bad", "good")
     made = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
-    bad, good = (copied(folder, f"changed_{i}") for i, folder in enumerate(made))
+    bad, good = (
+        shutil.copytree(folder, folder.with_name(f"changed_{i}")) for i, folder in enumerate(made)
+    )
+    choose(bad, good)
     study = bad / "study.yaml"
     study.write_text(re.sub("downsampling: .*", "downsampling: 0.7", study.read_text()))
     commands.call("compare", bad, "--against", good, "--out", "out")
@@ -248,13 +251,17 @@ def test_mistakes_are_told_in_a_sentence(arguments, words):
     assert words in commands.refused("compare", *arguments)
 
 
-def copied(folder, name, file="", **changed):
-    """A copy of a side as replays of a fixed set; one file of the first drive has a change."""
+def choose(*sides):
+    """Let the sets that were driven be chosen ones: these are not driven again."""
+    for side in sides:
+        inputs = next(side.glob("replays/drive_a/baseline-*/inputs.json"))
+        (side / "fixed.yaml").write_text(json.dumps(manifest.recorded(inputs)["parameters"]))
+
+
+def edited(folder, name, **changed):
+    """A copy of a side whose replays are made from something else."""
     copy = shutil.copytree(folder, folder.with_name(name))
-    for path in (copy / "replays").iterdir():
-        (path / "baseline").rename(path / "fixed")
-    if file:
-        path = copy / "replays/drive_a" / file
+    for path in copy.glob("replays/*/baseline-*/inputs.json"):
         manifest.record(path, manifest.recorded(path) | changed)
     return copy
 
@@ -267,32 +274,27 @@ def refused(new, old):
 @pytest.mark.usefixtures("bags")
 def test_what_does_not_compare_is_refused():
     gate("bad", "good")
-    made = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
-    bad, good = (copied(folder, name) for folder, name in zip(made, "xy", strict=True))
-    before = next(Path("runs/compare").glob("good_*/"))
-    other = copied(before, "other", "fixed/inputs.json", reader=92)
-    assert "read it differently: reader changed from" in refused(bad, other)
-    judged_by = copied(before, "judge", "reference.inputs.json", reference={"drive_a": ["x"]})
-    assert "are judged by different references" in refused(bad, judged_by)
-    for key, value in {"real_time": {"rate": 2.0}, "period": 3.0}.items():
-        paced = copied(before, f"paced_{key}", "fixed/inputs.json", **{key: value})
-        assert f"with other values of online.{key}: " in refused(bad, paced)
-    only_baseline = shutil.copytree(before, before.with_name("only_baseline"))
-    said = refused(bad, only_baseline)
-    assert "was replayed as `fixed` only, and" in said
-    # Where one of three was interrupted, the mode that both have counts.
-    for name in ("drive_a", "drive_b", "drive_c"):
-        shutil.copytree(bad / f"replays/{name}/fixed", bad / f"replays/{name}/baseline")
-    done = commands.call("compare", bad, "--against", only_baseline, *COSTS)
-    assert "3 recordings: error" in done.stdout
-    shutil.copytree(before / "replays/drive_a/baseline", only_baseline / "replays/drive_a/fixed")
-    assert (
-        "3 recordings: error"
-        in commands.call("compare", bad, "--against", only_baseline, *COSTS).stdout
+    made, before = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
+    bad, good = (
+        shutil.copytree(one, one.with_name(to)) for one, to in ((made, "x"), (before, "y"))
     )
-    old = copied(before, "old")
-    (old / "replays/drive_a/fixed/inputs.json").unlink()
-    assert "an older adaptune did not record what this replay was made from" in refused(bad, old)
+    other = edited(before, "other", reader=92)
+    assert "read it differently: reader changed from" in refused(bad, other)
+    study = shutil.copytree(before, before.with_name("judge")) / "study.yaml"
+    study.write_text(study.read_text().replace("max_gap: ", "max_gap: 1", 1))
+    assert "are judged by different references" in refused(bad, study.parent)
+    paced = edited(before, "paced", real_time={"rate": 2.0})
+    assert "with other values of online.real_time: " in refused(bad, paced)
+    # A set that is no baseline.
+    fixed = {"keyframe_interval": 7.0}
+    of_fixed = edited(before, "of_fixed", parameters=fixed)
+    (of_fixed / "fixed.yaml").write_text(json.dumps(fixed))
+    assert "was replayed as `baseline` only, and" in refused(bad, of_fixed)
+    # Where one of three was interrupted, the mode that both have counts.
+    shutil.copytree(before / "replays/drive_a", of_fixed / "replays/drive_a", dirs_exist_ok=True)
+    done = commands.call("compare", bad, "--against", of_fixed, *COSTS)
+    assert "1 recording: error" in done.stdout
+    choose(bad, good)
     code = "import fcntl, sys, time; f = open(sys.argv[1], 'a'); fcntl.flock(f, fcntl.LOCK_EX)"
     with subprocess.Popen(
         [sys.executable, "-c", f"{code}; print(flush=True); time.sleep(600)", good / ".lock"],

@@ -476,8 +476,8 @@ def test_a_fleet_leaves_each_out_and_grows(tmp_path):
     assert "New in training: alley; " in said
     study = study_in(folder / f"{folder.name}.yaml").config
     assert ({*study.training}, study.test) == ({"street", "yard", "alley"}, ("park",))
-    numbers = {path.stem for path in folder.glob("trials/street/?????.npz")}
-    assert {path.stem for path in folder.glob("trials/alley/?????.npz")} == numbers
+    numbers = {path.stem for path in folder.glob("trials/street-*/?????.npz")}
+    assert {path.stem for path in folder.glob("trials/alley-*/?????.npz")} == numbers
     assert {path: path.stat().st_mtime_ns for path in trials} == trials
     assert (folder / "trials.csv").read_text().splitlines()[1].startswith(rows[1].split(".")[0])
 

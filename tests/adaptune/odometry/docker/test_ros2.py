@@ -379,7 +379,7 @@ def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
         assert done.exit_code == 0, done.output
     runs = tmp_path / "runs/icp_study"
     assert (runs / "fixed_icp.yaml").exists()
-    bank = runs / "replays/b/untrained"
+    (bank,) = (runs / "replays/b").glob("untrained-*")
     inputs = json.loads((bank / "inputs.json").read_text())["inputs"]
     assert inputs["switching"]["mechanism"] == "bank"
     assert json.loads((bank / "replay.json").read_text())["restarts"] == 0

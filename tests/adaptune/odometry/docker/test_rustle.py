@@ -305,11 +305,8 @@ def test_trials_do_not_depend_on_how_parameters_are_set_while_it_runs():
     assert one.steering == {}
     assert steered.steering == {"node": "/n", "set_parameter": ("x", "{name}", "{value}")}
     config = StudyConfig(odometry={"name": "rustle"}, training=("a",))
-    replays = [
-        ReplaySetup(config, factory, "live", ()).identity("adaptive", random_model())["switching"]
-        for factory in (one, steered)
-    ]
-    assert replays == [{"mechanism": "live"}, {"mechanism": "live"} | steered.steering]
+    setup = ReplaySetup(config, steered, "live", (), model=random_model())
+    assert setup.identity("standby")["switching"] == {"mechanism": "live"} | steered.steering
 
 
 def test_what_is_checked_before_a_campaign(tmp_path, monkeypatch):
