@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Summary, Trial, summarise
 from adaptune.bank.members import LEVER, RESTART, Agreement, share
+from adaptune.bank.rest import Backoff
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING, USUAL_SHARE
 from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
@@ -139,25 +140,28 @@ class BankSimulation:
 
         Members vote with weights of shape (n_periods, n_members). The reference takes the place of
         the short registrations. A bank restarts a member that was lost, where it may be lost again:
-        it is away until it may restart once more, or the health check restarts the whole bank.
+        it is away until it may restart once more, or has rested, see `Backoff`, or the health check
+        restarts the whole bank.
         """
         T_previous_current = self.motions(members)
         agreement, guard = Agreement(len(members), self.lost_track), Guard(self.health)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
         weights, now = self._of_steps(votes), 0.0
-        back = np.full(len(members), -np.inf)  # when members that were lost are back
+        back, losses = np.full(len(members), -np.inf), Backoff(len(members), free=1)
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
             now += seconds
-            lost = np.isnan(T_previous_current[i, :, 0, 0])
-            back[lost & (back <= now)] = now + RESTART
-            T = np.where((back > now)[:, None, None], np.nan, T_previous_current[i])
+            away = (now < back) | losses.resting(now)
+            lost = np.isnan(T_previous_current[i, :, 0, 0]) & ~away
+            T = np.where((lost | away)[:, None, None], np.nan, T_previous_current[i])
             alignment = partial(self._misplaced, i + 1)
             agreeing[i] = agreement.judge(T, seconds, weights[i], alignment)
             if guard.check(agreement.T_previous_current, seconds) is None:
+                losses.fail(lost | (agreement.due & ~away), now)
+                back[lost] = now + RESTART
                 agreement.restarted(agreement.due)
             else:
                 agreement.start()
-                back[:] = -np.inf
+                back, losses = np.full(len(members), -np.inf), Backoff(len(members), free=1)
         return agreeing
 
     def healthy(self, T_previous_current: Poses) -> Poses:

@@ -13,6 +13,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from adaptune.bank.members import Agreement, spread
+from adaptune.bank.rest import Backoff
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
 from adaptune.odometry.base import LOST, Motions, OdometryInstance, Registration, Usage
@@ -256,7 +257,8 @@ class Bank(OdometryInstance):
 
     The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
     others restart on the scans of the last seconds, at most once a second, and so do members that a
-    fault has ended, or that have rested. `restarts` counts how often a member was restarted.
+    fault has ended, or that have rested. One that is lost again within a minute rests first, see
+    `Backoff`. `restarts` counts how often a member was restarted.
 
     Parameters
     ----------
@@ -308,6 +310,7 @@ class Bank(OdometryInstance):
         self._short = ShortRegistrations()
         self._lost = False
         self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
+        self._losses = Backoff(len(sets), free=1)
         self._first: dict[Hashable, OdometryInstance] = {}
         self._past: deque[PastScan] = deque()  # of the last seconds
         self._warm_up = warm_up
@@ -330,7 +333,10 @@ class Bank(OdometryInstance):
 
     def prepare(self, scan: Scan) -> PreparedScan:
         prepared = PreparedScan(scan, self._first)
-        self.late.resting = self._resting
+        resting = self._resting | self._losses.resting(scan.stamp * 1e-9)
+        resting = self._resting if resting.all() else resting  # somebody has to go on
+        self._waking = (self._waking | self.late.resting) & ~resting
+        self.late.resting = resting
         self.late.begin()
         for member in self._present:
             prepared.by(member)
@@ -354,12 +360,12 @@ class Bank(OdometryInstance):
         self._lost = selection.in_doubt
         self._asked = np.isin(self.trials, list(selection.restart))
         self._resting = np.isin(self.trials, list(selection.resting))
-        self._waking = (self._waking | self.late.resting) & ~self._resting
 
     def start(
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self.late.resting = self._resting
+        self._losses = Backoff(len(self.trials), free=1)
         self._returning.clear()
         self.late.away[:] = False
         self.late.begin()
@@ -382,7 +388,7 @@ class Bank(OdometryInstance):
         self._waking &= ~woken
         # Those that work go first: before they begin, the woken ones cannot go on in their place.
         self.late.absent |= woken
-        self._restart(self._asked)
+        self._lose(self._asked, prepared.stamp)
         self.late.absent &= ~woken
         self._restart(woken)
         self._asked[:] = False
@@ -410,7 +416,7 @@ class Bank(OdometryInstance):
             self._past.popleft()
         self.late.given(T_odom_sensor)
         self._catch_up()
-        self._restart(self._agreement.due)
+        self._lose(self._agreement.due, scan.stamp)
         registered = np.array([registration.registered for registration in registrations])
         return Registration(T_odom_sensor, bool(registered[agreeing].any()))
 
@@ -420,6 +426,12 @@ class Bank(OdometryInstance):
 
     def _member_motions(self, T_odom_previous: Poses) -> Poses:
         return np.array([self.late.motion(i, T_odom_previous) for i in range(len(self._members))])
+
+    def _lose(self, members: NDArray[np.bool_], stamp: int) -> None:
+        """Restart members that are lost, or let them rest first."""
+        now = stamp * 1e-9
+        self._losses.fail(members & ~self.late.working, now)
+        self._restart(members & ~self._losses.resting(now))
 
     def _restart(self, members: NDArray[np.bool_]) -> None:
         """Restart members at the bank's pose, but for those that have given up or are late."""

@@ -55,16 +55,17 @@ def test_a_member_that_is_killed_costs_its_weight_and_nothing_else(order, caplog
     scans = [Scan(stamp, points) for stamp, points, _ in drives.scans(0, 110, STEP)]
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         found = replay(killing(scans), bank, HealthCheck(), selector)
-    assert not any(member.ended for member in bank._members)
+    # The second time, it rests for longer than the drive.
+    assert sum(member.ended for member in bank._members) == 1
     bank.close()
     T = found.trajectory.T_world_sensor[-1]
     assert np.linalg.norm(T[:3, 3] - [STEP * (len(scans) - 1), 0.0, 0.0]) < 0.1
     assert not found.restarted.any()
-    # It restarts at most once a second, so it is dead most of the time.
-    assert bank.restarts == len(bank.faults) == 3
+    assert bank.restarts == 1
     told = [r.getMessage() for r in caplog.records if r.name == "adaptune.bank.bank"]
     what = "its process was ended by SIGKILL; the bank goes on without it"
-    assert told == [f"trial 12 (genz_icp) ended: {what}", "trial 12 (genz_icp) is back"] * 3
+    ended = f"trial 12 (genz_icp) ended: {what}"
+    assert told == [ended, "trial 12 (genz_icp) is back", ended]
     weights = [choice.selection.weights for choice in found.choices]
     # Once a second, before the scan is registered.
     assert weights[4][12] > 0.05

@@ -83,7 +83,7 @@ def test_members_that_restart_see_the_same_scans(scans):
     def restarting(odometry):
         def before(i):
             if i in (10, 25):
-                told = frozenset(odometry.trials[1:])
+                told = frozenset(odometry.trials[1:3] if i == 10 else odometry.trials[3:])
                 weights = dict.fromkeys(odometry.trials, 0.2)
                 odometry.apply(Selection(0, {}, weights, restart=told))
 
@@ -95,7 +95,7 @@ def test_members_that_restart_see_the_same_scans(scans):
         patch.setattr("adaptune.bank.members.KEPT", 4)
         # The other process has its own limit: it must know what this one forgot.
         same, others = run(other, scans, restarting(other))
-    assert one.restarts == other.restarts == 8
+    assert one.restarts == other.restarts == 4
     np.testing.assert_array_equal(same, poses)
     np.testing.assert_array_equal(others, motions)
     assert KEPT > 12 * 10
