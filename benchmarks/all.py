@@ -90,7 +90,7 @@ BENCHMARKS = {
         ["selection.py"],
         ["selection.py"],
         [
-            Figure("selection, `paper`", "", rf"paper .* selection: median {N} ms", "ms", 1),
+            Figure("selection, `paper`", "", rf"paper .* selection: median {N} ms", "ms", 10),
             Figure("selection, `adaptive`", "", rf"adaptive .* selection: median {N} ms", "ms", 5),
             Figure("weights of a bank", "", rf"bank .* selection: median {N} ms", "ms", 5),
             Figure(
@@ -98,7 +98,7 @@ BENCHMARKS = {
                 "scikit-learn's regressor",
                 rf"TPE: .*, {N} times ours",
                 "",
-                300,
+                100,
                 True,
             ),
             Figure("model of 14,136 frames, 1536 sets", "", rf"file {N} MB", "MB", 100),
