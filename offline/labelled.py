@@ -147,7 +147,7 @@ class BankSimulation:
         agreement, guard = Agreement(len(members), self.lost_track), Guard(self.health)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
         weights, now = self._of_steps(votes), 0.0
-        back, losses = np.full(len(members), -np.inf), Backoff(len(members), free=1)
+        back, losses = np.full(len(members), -np.inf), Backoff(len(members))
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
             now += seconds
             away = (now < back) | losses.resting(now)
@@ -156,12 +156,12 @@ class BankSimulation:
             alignment = partial(self._misplaced, i + 1)
             agreeing[i] = agreement.judge(T, seconds, weights[i], alignment)
             if guard.check(agreement.T_previous_current, seconds) is None:
-                losses.fail(lost | (agreement.due & ~away), now)
+                losses.lose(lost | (agreement.due & ~away), now)
                 back[lost] = now + RESTART
                 agreement.restarted(agreement.due)
             else:
                 agreement.start()
-                back, losses = np.full(len(members), -np.inf), Backoff(len(members), free=1)
+                back, losses = np.full(len(members), -np.inf), Backoff(len(members))
         return agreeing
 
     def healthy(self, T_previous_current: Poses) -> Poses:

@@ -310,7 +310,7 @@ class Bank(OdometryInstance):
         self._short = ShortRegistrations()
         self._lost = False
         self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
-        self._losses = Backoff(len(sets), free=1)
+        self._losses = Backoff(len(sets))
         self._first: dict[Hashable, OdometryInstance] = {}
         self._past: deque[PastScan] = deque()  # of the last seconds
         self._warm_up = warm_up
@@ -365,7 +365,7 @@ class Bank(OdometryInstance):
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self.late.resting = self._resting
-        self._losses = Backoff(len(self.trials), free=1)
+        self._losses = Backoff(len(self.trials))
         self._returning.clear()
         self.late.away[:] = False
         self.late.begin()
@@ -430,7 +430,7 @@ class Bank(OdometryInstance):
     def _lose(self, members: NDArray[np.bool_], stamp: int) -> None:
         """Restart members that are lost, or let them rest first."""
         now = stamp * 1e-9
-        self._losses.fail(members & ~self.late.working, now)
+        self._losses.lose(members & ~self.late.working, now)
         self._restart(members & ~self._losses.resting(now))
 
     def _restart(self, members: NDArray[np.bool_]) -> None:
