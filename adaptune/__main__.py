@@ -5,7 +5,7 @@ import resource
 import signal
 import sys
 
-_FILES = 1 << 16
+_OPEN_FILES = 1 << 16
 
 
 def _leave(*_: object) -> None:
@@ -23,7 +23,7 @@ def main() -> None:
         signal.signal(signal.SIGINT, _leave)
     # A recording may have more parts than the 1024 files that most systems begin with.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = _FILES if hard < 0 else min(hard, _FILES)
+    most = _OPEN_FILES if hard < 0 else min(hard, _OPEN_FILES)
     if 0 <= soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
     try:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps
 
-WORST = 0.1  # share of the stretches that are the worst
+WORST = 0.1  # share of the segments that are the worst
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 JITTER = 0.1
 """Metres. A robot that stands does not drive by the noise of its poses, where that is less."""
@@ -236,9 +236,9 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def worst_tenth(logs: NDArray[np.float64]) -> float:
-    """Mean over the worst tenth of the stretches' logarithms of the ratio to the fixed set's error.
+    """Mean over the worst tenth of the segments' logarithms of the ratio to the fixed set's error.
 
-    It is the conditional value at risk: where a tenth is no whole number, a stretch counts in part.
+    It is the conditional value at risk: where a tenth is no whole number, a segment counts in part.
     """
     share = max(1.0, WORST * len(logs))
     counts = np.clip(share - np.arange(len(logs)), 0.0, 1.0)

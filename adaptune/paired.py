@@ -103,10 +103,10 @@ def joined(errors: ArrayLike, freedom: ArrayLike) -> tuple[float, float]:
     return math.sqrt(total), float(total**2 / (variances**2 / each).sum())
 
 
-def of_stretches(logs: NDArray[np.float64], recordings: Sequence[str]) -> Ratio:
-    """The geometric mean of ratios on stretches, given their logarithms and their recordings.
+def of_segments(logs: NDArray[np.float64], recordings: Sequence[str]) -> Ratio:
+    """The geometric mean of ratios on segments, given their logarithms and their recordings.
 
-    A unit of evidence is a recording where there are `MIN_RECORDINGS`, else a stretch.
+    A unit of evidence is a recording where there are `MIN_RECORDINGS`, else a segment.
     """
     n = len(logs)
     spread = float(logs.std(ddof=1)) if n > 1 else math.inf

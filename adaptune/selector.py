@@ -10,21 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.bank.members import share
-from adaptune.geometry import Poses
 from adaptune.live.evidence import LiveEvidence, spread_of
 from adaptune.metrics import FAILURE
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.descriptor import (
-    MOTION,
-    SECOND,
-    Describer,
-    DescriptorError,
-    fill_in,
-    lowest_elevation,
-    speed_and_turn_rate,
-)
-from adaptune.model.registry import ADAPTIVE, STANDBY, asked, rule_class, selected
-from adaptune.model.rules import NOVEL_FAMILIARITY, Live
+from adaptune.model.descriptor import Describer, DescriptorError, lowest_elevation
+from adaptune.model.registry import ADAPTIVE, STANDBY, call_user_code, rule_class, selected
+from adaptune.model.rules import NOVEL_SIMILARITY, Evidence
 from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
@@ -39,13 +30,17 @@ from adaptune.space import (
 )
 
 SCANS_TO_KNOW = 10
-"""The sensor is recognised by the median over this many scans that selections are made from."""
+"""The sensor is recognised by this many scans that selections are made from."""
+SCANS_TO_WARN = 3
+"""Before so many there is no warning: the first scan of a drive may be incomplete."""
 
 MAX_TIMES_PREDICTED = 2.0
 """A single odometry leaves a set whose error is surely more than so many times the predicted."""
 REMEMBERED = 60.0
 """Seconds for which a failure, or what was measured of that set, counts, and not what is predicted;
 and for which members of a bank keep working that would otherwise rest."""
+BUDGET_SECONDS = 600.0
+"""Over so many seconds, the mean cost of a bank keeps to the user's budget, unless it is lost."""
 UNUSUAL = 0.9
 """Quantile of the members' spread in training that counts as usual."""
 SETTLING = 2 * 10**9
@@ -135,8 +130,8 @@ class _Measuring:
         """
         if not self._gives_weights:
             return Selection(self.fixed, self._sets[self.fixed])
-        share = 1.0 / len(self._always)
-        weights = {member: share * (member in self._always) for member in self.members}
+        equal = 1.0 / len(self._always)
+        weights = {member: equal * (member in self._always) for member in self.members}
         return Selection(self.fixed, self._sets[self.fixed], weights)
 
     def _weighted(self, weights: NDArray[np.float64]) -> Selection:
@@ -220,8 +215,8 @@ class Selector(_Measuring):
             spreads = spread_of(np.where(np.isfinite(vectors), vectors, FAILURE))
             self._usual_spread = float(np.quantile(spreads, UNUSUAL))
         data = model.training_data(self._pca, self.members or None)
-        self._rule = asked(cls.of, model.bank_settings if gives_weights else None)
-        asked(self._rule.fit, data)
+        self._rule = call_user_code(cls.of, model.bank_settings if gives_weights else None)
+        call_user_code(self._rule.fit, data)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -241,36 +236,28 @@ class Selector(_Measuring):
         self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
         self._current: int | None = None
         self._stamp = self._switched = 0
-        self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
         self._elevations: list[float] = []
         self._warned = False
         # By trial, the error in percent that was measured of a set that did worse than predicted,
         # and until when it counts, in seconds.
         self._worse: dict[int, tuple[float, float]] = {}
         self._all_work_until = -np.inf  # seconds, before which no member of a bank may rest
+        # Seconds of the last selections, and what the members at work cost then.
+        self._spent: deque[tuple[float, float]] = deque()
         self._resting: frozenset[int] = frozenset()
-        self._familiar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
+        self._similar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
         self._starts: int | None = None
         self._failed = False
         self._predicted = np.nan
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """See `AnySelector.observe`."""
+        # The first start comes after the first scan.
         if self._scan is not None:
-            self._go_on(motions)
+            self._failed |= self._starts is not None and motions.starts > self._starts
+            self._starts = motions.starts
         self._scan, self._stamp = scan, stamp
         super().observe(stamp, scan, motions)
-
-    def _go_on(self, motions: Motions) -> None:
-        """Take note of what was moved, and whether the odometry has failed."""
-        # The first start comes after the first scan.
-        self._failed |= self._starts is not None and motions.starts > self._starts
-        self._starts = motions.starts
-        if np.isfinite(motions.T_previous_current).all():
-            T_odom_before = self._recent[-1][1] if self._recent else np.eye(4)
-            self._recent.append((self._stamp, T_odom_before @ motions.T_previous_current))
-            while len(self._recent) > 1 and self._recent[1][0] <= self._stamp - SECOND:
-                self._recent.popleft()
 
     def select(self) -> Selection:
         """Choose what to apply before the newest scan is registered.
@@ -284,16 +271,13 @@ class Selector(_Measuring):
         """
         if self._scan is None:
             raise ValueError("observe a scan before you select")
-        descriptor = self._describe(self._scan)
-        if MOTION in self._describe.blocks:
-            fill_in(descriptor, self._describe.blocks, self._motion())
-        self._descriptors.append(descriptor)
+        self._descriptors.append(self._describe(self._scan))
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
         self._foreign = self._rule.needs_known_sensor and self._is_foreign(self._scan)
         self._resting = frozenset()
-        live = Live(self._worse_than_predicted, self._live.squares, self._at_work)
-        selection = selected(self._rule, self._sets, feature, live, self.members)
+        evidence = Evidence(self._worse_than_predicted, self._live.squares, self._at_work)
+        selection = selected(self._rule, self._sets, feature, evidence, self.members)
         selection = selection._replace(resting=self._resting)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
@@ -312,17 +296,35 @@ class Selector(_Measuring):
         return self._live.estimated(selection)
 
     def _at_work(
-        self, members: Sequence[int], familiarity: float, predicted: float
+        self, members: Sequence[int], similarity: float, predicted: float
     ) -> Sequence[int]:
-        """See `Live.at_work`."""
-        self._familiar.append(0.0 if self._foreign else familiarity)
-        if self._reserve and self._is_enough(predicted):
+        """See `Evidence.at_work`."""
+        self._similar.append(0.0 if self._foreign else similarity)
+        if not self._reserve:
+            return members
+        # Somebody has to go on.
+        present = self._live.present()[np.isin(self.members, self._always)].any()
+        if (self._is_enough(predicted) or not self._can_pay()) and present:
             self._resting = self._reserve
-        return [member for member in members if member not in self._resting]
+        at_work = [member for member in members if member not in self._resting]
+        if (costs := self._model.costs) is not None and self._model.milliseconds is not None:
+            now = self._stamp * 1e-9
+            self._spent.append((now, costs.adaptive(at_work)))
+            while self._spent[0][0] <= now - BUDGET_SECONDS:
+                self._spent.popleft()
+        return at_work
+
+    def _can_pay(self) -> bool:
+        """Whether all may work: within the budget in the mean, or because the bank is lost."""
+        budget, costs = self._model.milliseconds, self._model.costs
+        if budget is None or costs is None or self._failed or self._live.health.state == "lost":
+            return True
+        spent = [cost for _, cost in self._spent]
+        return float(np.mean([*spent, costs.adaptive(self.members)])) <= budget
 
     def _is_new(self) -> bool:
         """Whether training does not know the place."""
-        return bool(self._familiar) and float(np.median(self._familiar)) < NOVEL_FAMILIARITY
+        return bool(self._similar) and float(np.median(self._similar)) < NOVEL_SIMILARITY
 
     def _in_doubt(self) -> bool:
         """Whether a bank at work is in a new place, or differs by more than in training."""
@@ -341,9 +343,7 @@ class Selector(_Measuring):
         is_new = not self._stands_by and self._is_new()
         if is_new or is_worse or self._failed or self._live.health.state in IN_DOUBT:
             self._all_work_until = seconds + REMEMBERED
-        # Somebody has to go on.
-        present = self._live.present()[np.isin(self.members, self._always)]
-        return seconds >= self._all_work_until and bool(present.any())
+        return seconds >= self._all_work_until
 
     def _worse_than_predicted(self) -> Mapping[int, float]:
         """By trial, what was measured of sets that have done worse than predicted, in percent."""
@@ -358,13 +358,6 @@ class Selector(_Measuring):
             elif error is not None and error.low > MAX_TIMES_PREDICTED * self._predicted:
                 self._worse[current] = error.mean, seconds + REMEMBERED
         return {trial: error for trial, (error, _) in self._worse.items()}
-
-    def _motion(self) -> NDArray[np.float64]:
-        """Speed and turn rate over the last second of registered scans, of shape (2,)."""
-        if not self._recent:
-            return np.zeros(2)
-        stamps, poses = zip(*self._recent, strict=True)
-        return np.asarray(speed_and_turn_rate(np.array(stamps, np.int64), np.array(poses))[-1])
 
     def _of_those_present(self, selection: Selection) -> Selection:
         """Replace a member that gives no poses by the first one that does."""
@@ -387,7 +380,7 @@ class Selector(_Measuring):
             parameters=self._sets[self.fixed],
             weights=selection.weights and self._measured().weights,
             predicted_error=selection.predicted_fixed,
-            familiarity=0.0,
+            similarity=0.0,
         )
 
     def _is_foreign(self, scan: Scan) -> bool:
@@ -396,18 +389,18 @@ class Selector(_Measuring):
             self._elevations.append(lowest_elevation(scan))
         if not self._elevations:
             return False
-        lowest = float(np.median(self._elevations))
-        if not self._model.is_foreign(lowest):
+        foreign = [self._model.is_foreign(elevation) for elevation in self._elevations]
+        if 2 * sum(foreign) <= len(foreign):
             return False
-        if not self._warned:
+        if not self._warned and len(foreign) >= SCANS_TO_WARN:
+            self._warned = True
             known = sorted({f"{elevation:.0f}" for elevation in self._model.elevations})
             _log.warning(
                 "the scans' lowest points lie at %.0f degrees, those of training at %s: this is "
                 "another sensor or mount, of which the training says nothing",
-                lowest,
+                np.median(self._elevations),
                 ", ".join(known),
             )
-        self._warned = True
         return True
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from adaptune._system.strict import ConfigurationError, StrictModel, in_one_line
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.strict import ConfigurationError, StrictModel, in_one_line
 
 Value = float | int | str | bool
 ParameterSet = dict[str, Value]
@@ -219,10 +219,6 @@ class ParameterSpace:
     def flat(self, parameters: ParameterSet) -> ParameterSet:
         """The set with the names that `parameters` of this space has."""
         return parameters
-
-    def row(self, parameters: Mapping[str, Value]) -> dict[str, Value | None]:
-        """The set as columns of a table, in the order of `names`; None where it has no value."""
-        return {name: parameters.get(name) for name in self.names}
 
     def check(self, parameters: Mapping[str, object]) -> None:
         """Raise a SpaceError for a set with missing, unknown or out-of-range parameters."""
@@ -503,8 +499,8 @@ class Selection(NamedTuple):
         Percent.
     predicted_fixed : float
         Percent, the predicted error of the fixed set at this scan.
-    familiarity : float
-        Share of the training frames that are farther from the other training stretches than the
+    similarity : float
+        Share of the training frames that are farther from the other training segments than the
         scan is from all of them; NaN where the rule does not compute it.
     estimated_error, estimated_low, estimated_high : float
         Percent, the odometry's own error over the last metres as it was measured without ground
@@ -524,7 +520,7 @@ class Selection(NamedTuple):
     weights: Mapping[int, float] | None = None
     predicted_error: float = math.nan
     predicted_fixed: float = math.nan
-    familiarity: float = math.nan
+    similarity: float = math.nan
     estimated_error: float = math.nan
     estimated_low: float = math.nan
     estimated_high: float = math.nan
@@ -532,6 +528,10 @@ class Selection(NamedTuple):
     why: str = ""
     restart: frozenset[int] = frozenset()
     resting: frozenset[int] = frozenset()
+
+    def same_as(self, other: "Selection") -> bool:
+        """Whether both have the odometry do the same, whatever is predicted."""
+        return self[:3] == other[:3]
 
     @property
     def lost(self) -> bool:

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import geometry
+from adaptune._system.files import write_text
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
 from adaptune.geometry import Poses
 
 _log = logging.getLogger(__name__)
@@ -58,6 +58,11 @@ class Trajectory:
         return len(self.stamps)
 
     @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Since the first pose, of shape (n,)."""
+        return np.asarray((self.stamps - self.stamps[0]) * 1e-9)
+
+    @property
     def sparse(self) -> str:
         """Where many poses are further apart than `max_gap`: how many, and what to set."""
         seconds = np.diff(self.stamps) * 1e-9
@@ -90,7 +95,7 @@ class Trajectory:
             from scipy.spatial.transform import Rotation, Slerp
 
             # Stamps are exact integers; only differences, which fit a double, become floats.
-            seconds = (self.stamps - self.stamps[0]) * 1e-9
+            seconds = self.seconds
             query = (stamps[between] - self.stamps[0]) * 1e-9
             T[between] = np.eye(4)
             rotations = Rotation.from_matrix(self.T_world_sensor[:, :3, :3])

@@ -25,18 +25,18 @@ from numpy.typing import NDArray
 from adaptune.bank.bank import Bank
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.recording.compensation import compensate_neighbours
+from adaptune.runs.loop import replay
 from adaptune.selector import Selector
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets
 from adaptune.study.config import OdometryConfig
+from offline.bank_choice import BANK_SETTINGS, bank_errors, cancelling_members
 from offline.config import OfflineStudyConfig
 from offline.labelled import LabelledData, LabelledSequence, periods
 from offline.samplers import sobol_points
 from offline.train import fit
-from offline.tuning import BANK_SETTINGS, bank_errors, cancelling_members
 from online.modes import EvenSelector
-from online.replay import replay
 
 
 class Kind(NamedTuple):
@@ -117,7 +117,7 @@ def drive(kind: Kind, seed: int, others: LabelledData, members: list[int], way: 
     selector = even if way == "even" else chosen
     with closing(Bank(FACTORY, {n: TABLE[n] for n in members})) as bank:
         fixed = selector.fall_back()
-        record = replay(scans, bank, kind.config.health, selector, fixed=fixed)
+        record = replay(scans, bank, kind.config.health, selector, fallback=fixed)
         restarts = bank.restarts
     T_ref_sensor = np.array([scan.T_world_sensor for scan in scans])
     errors = sub_trajectory_rte(T_ref_sensor, record.trajectory.T_world_sensor, 10.0)

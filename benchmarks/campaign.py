@@ -12,7 +12,7 @@ the bare loop's time with one worker, 1.8 times faster with two, where two bare 
 *memory* lets a worker, which may keep 0.4 GB of prepared scans, run a trial on each of four caves,
 ROUNDS (4) times. Each cave makes room for the next one. It prints the worker's memory at the end,
 as a ratio to what it keeps, and its CPU time: as it is, and without
-`adaptune.machine.freeing_large_arrays`.
+`adaptune._system.machine.freeing_large_arrays`.
 Limit: 2 times what it keeps.
 
 *size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are random numbers, and prints
@@ -39,18 +39,19 @@ from stages import bare_gicp
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import drives
+from made_trials import run_along
 from rooms import along_x
 
-from adaptune import yaml12
-from adaptune.archive import Archive, Frames
+from adaptune._system import yaml12
 from adaptune.odometry.keyframe import crop
+from adaptune.runs.archive import Archive, Frames
+from adaptune.runs.record import Run
 from adaptune.simulation.record import record
 from offline import shared_scans, workers
 from offline import train as training
 from offline.config import OfflineStudy, load_study
-from offline.drive import Drive, TrialSetup
-from offline.frames import describe
-from offline.stretches import Stretch, stretches_along
+from offline.drive import TrialSetup
+from offline.frames import Segment, describe, segments_along
 from offline.workers import Result, Task
 
 STUDY = """\
@@ -139,12 +140,12 @@ def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     setup = TrialSetup(study.config, study.odometry, study.sequences)
     bench = workers.Bench(setup, 0.4e9)
     frames = {name: describe(study.config, study.sequences, name) for name in study.training}
-    stretches = {name: stretches_along(name, of.uncut)[0] for name, of in frames.items()}
+    segments = {name: segments_along(name, of.uncut)[0] for name, of in frames.items()}
     before, begin = _memory(), time.process_time()
     # All but the baseline's clouds are prepared while trials run.
     sets = [study.odometry.space.baseline | {"downsampling": d} for d in (0.25, 0.35, 0.7)]
     for i, name in enumerate(n * study.training):
-        task = Task(name, stretch=stretches[name], sets={0: sets[i % len(sets)]})
+        task = Task(name, segment=segments[name], sets={0: sets[i % len(sets)]})
         bench.run(task, lambda *_: None)
     kept = 1e-6 * sum(shared.nbytes for shared in bench._shared.values())
     return (_memory() - before) / kept, time.process_time() - begin
@@ -194,9 +195,9 @@ class Drawn:
     def wait(self) -> list[tuple[int, Result]]:
         """Draw its drives."""
         assert self._task is not None
-        stretch = self._task.stretch
-        if stretch is not None:
-            return [(0, {number: [_drawn(number, stretch)] for number in self._task.sets})]
+        segment = self._task.segment
+        if segment is not None:
+            return [(0, {number: [_drawn(number, segment)] for number in self._task.sets})]
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
             along_x(0.3 * np.arange(N_FRAMES)),
@@ -208,14 +209,10 @@ class Drawn:
         return [(0, frames)]
 
 
-def _drawn(number: int, stretch: Stretch) -> Drive:
-    rng, drive = np.random.default_rng(number), Drive.lost(stretch)
+def _drawn(number: int, segment: Segment) -> Run:
+    rng = np.random.default_rng(number)
     factor = 1.0 + 0.01 * rng.gamma(1.0)
-    drive.T_odom_sensor = along_x(0.3 * factor * np.arange(len(stretch.stamps)))
-    drive.registered[:] = drive.tried[:] = True
-    drive.without_pose[:] = False
-    drive.seconds[1:] = rng.gamma(1.0, size=len(stretch.stamps) - 1)
-    return drive
+    return run_along(segment.stamps, 0.3 * factor, rng.gamma(1.0))
 
 
 def _memory() -> float:

@@ -35,10 +35,10 @@ import kills
 import needs
 import ros2_reference
 
-from adaptune import yaml12
-from adaptune.odometry.docker.engine import OWNER, engine, is_orphan
-from adaptune.odometry.docker.ros2_system import Ros2
+from adaptune._system import yaml12
 from adaptune.odometry.remote import Limits
+from adaptune.odometry.systems.engine import OWNER, engine, is_orphan
+from adaptune.odometry.systems.ros2_system import Ros2
 from adaptune.recording import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
@@ -222,7 +222,7 @@ def main(what: str, n: int, seed: int) -> None:
     if what == "ros2":
         ros2(n)
         return
-    logging.getLogger("adaptune.odometry.docker.ros_system").setLevel(logging.INFO)
+    logging.getLogger("adaptune.odometry.systems.ros_system").setLevel(logging.INFO)
     with study_file() as path:
         if what == "cost":
             cost(path, n)

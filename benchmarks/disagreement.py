@@ -32,7 +32,7 @@ LENGTH = 5.0
 
 
 def errors(scans: list[SimulatedScan], set_: tuple[float, ...], scene_length: float) -> list[float]:
-    """Mean capped errors of a set in each scene, in percent."""
+    """Mean clipped errors of a set in each scene, in percent."""
     space = odometry_class("gicp").space
     names = ("max_correspondence_distance", "keyframe_interval", "downsampling")
     parameters = {**dict(zip(names, set_, strict=True)), "iterations": 20}

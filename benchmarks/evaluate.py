@@ -33,12 +33,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
+from adaptune._system.open3d import load
 from adaptune.errors import AdaptuneError
 from adaptune.evaluation.judged import Judge, Judged
 from adaptune.geometry import Poses
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
-from adaptune.open3d import load
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import Scan

@@ -34,22 +34,22 @@ import fuzz
 import local_link
 from random_models import random_model
 
-from adaptune import processes, yaml12
-from adaptune.archive import Archive, Frames, Trial
+from adaptune._system import processes, yaml12
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
-from adaptune.odometry.docker.played_bag import PoseRecorder
-from adaptune.odometry.docker.ros_system import PoseReader
 from adaptune.odometry.program import CommandSettings, read_output
+from adaptune.odometry.systems.played_bag import PoseRecorder
+from adaptune.odometry.systems.ros_system import PoseReader
 from adaptune.odometry.template import Template
 from adaptune.recording import Scan, SequenceConfig
 from adaptune.recording.folder import read_scan
 from adaptune.recording.recording import open_sequence
 from adaptune.reference.stored import StoredEstimate
+from adaptune.runs.archive import Archive, Frames, Trial
 from adaptune.selector import Selector
 from adaptune.trajectory import Trajectory, read_trajectory, write_tum
-from adaptune.trial_rows import rows
+from offline.trial_table import rows
 
 BYTES = 3 << 30
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -124,9 +124,7 @@ def archive(folder: Path) -> fuzz.Case:
     described = rng.integers(0, 9, (n, 90)).astype(np.float32)
     made.write_frames("one", Frames(STAMPS, poses(), described, {"ndt": 90}, np.zeros(n, "f4")))
     for number in range(3):
-        trial = Trial(
-            {"a": 1.0 + number}, poses(), rng.gamma(1, 1, n), nothing, ~nothing, described[:, 0]
-        )
+        trial = Trial.of({"a": 1.0 + number}, poses(), rng.gamma(1, 1, n), nothing, 1.0)
         made.write("one", number, trial)
 
     def read(_: Path) -> object:

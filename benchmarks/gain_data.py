@@ -13,8 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 from made_drives import trials_of
 
-from adaptune.archive import Frames
-from adaptune.files import replacing
+from adaptune._system.files import replacing
 from adaptune.live.hops import Hops
 from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
@@ -22,6 +21,7 @@ from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.recording.scan import Scan
+from adaptune.runs.archive import Frames
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
@@ -196,7 +196,7 @@ def in_place(
     vectors: NDArray[np.float32],
     known: NDArray[np.bool_],
 ) -> LabelledSequence:
-    """A recording of one stretch, with the errors of all sets on its known frames."""
+    """A recording of one segment, with the errors of all sets on its known frames."""
     frames = np.flatnonzero(known)
     of = (name, name, simulation, frames, np.zeros(len(frames), np.intp), errors)
     of_sets = dict(enumerate(np.moveaxis(vectors, 1, 0)))

@@ -10,12 +10,12 @@ from adaptune.live.hops import Hop
 from adaptune.live.own_error import Link, OwnErrors
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MEMBER_CLIP, clip_errors, minimum_variance_weights
+from offline.bank_choice import cancelling_members
 from offline.labelled import LabelledData, LabelledSequence, chained, periods
-from offline.tuning import cancelling_members
 from offline.validate import Validation, leave_one_out, leave_out
 
 Errors = dict[str, NDArray[np.float64]]
-"""Capped errors on a sequence in several modes, at each frame that has a sub-trajectory."""
+"""Clipped errors on a sequence in several modes, at each frame that has a sub-trajectory."""
 
 
 def validate(data: LabelledData, size: int) -> None:

@@ -15,21 +15,23 @@ import shutil
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from adaptune._system.progress import unseen
 from adaptune.geometry import invert, scale, steps
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.progress import unseen
 from adaptune.simulation.course import SCENES, Course
 from adaptune.simulation.record import record
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from adaptune.tuning.asked import Asked
 from adaptune.tuning.sides import costs, sides
-from online.gate import Gate, Side, compare_sides, shared_replays
+from offline.config import OfflineStudy, load_study
+from online.gate import Gate, compare_sides, shared_replays
 
 ODOMETRY = "gate:Plain"
 LONGER, FURTHER = 1.3, 1.1
@@ -91,22 +93,20 @@ def planted_poses(truth: Any, odometry: Any, length: float, kind: str) -> Any:
     return poses(high)
 
 
-def planted(old: Side, kind: str) -> Side:
+def planted(old: OfflineStudy, kind: str) -> OfflineStudy:
     """The old side with more error."""
-    folder = old.study.folder.with_name(f"{old.study.folder.name}_{kind}")
-    shutil.copytree(old.study.folder, folder, ignore=shutil.ignore_patterns(".lock"))
+    folder = old.folder.with_name(f"{old.folder.name}_{kind}")
+    shutil.copytree(old.folder, folder, ignore=shutil.ignore_patterns(".lock"))
     for path in folder.glob("replays/*/baseline-*/trajectory.tum"):
         (judged,) = path.parents[1].glob("reference-*/reference.tum")
         replayed, reference = read_tum(path), read_tum(judged)
         truth, odometry = reference.at(replayed.stamps), replayed.T_world_sensor
-        poses = planted_poses(truth, odometry, old.study.config.sub_trajectory, kind)
+        poses = planted_poses(truth, odometry, old.config.sub_trajectory, kind)
         write_tum(path, Trajectory(replayed.stamps, poses))
-    from offline.config import load_study
-
-    return Side(kind, load_study(str(folder)))
+    return replace(load_study(str(folder)), called=kind)
 
 
-def judge(new: Side, old: Side, *, cost: bool = True) -> Gate:
+def judge(new: OfflineStudy, old: OfflineStudy, *, cost: bool = True) -> Gate:
     """What the gate says."""
     shared = shared_replays(new, old)
     return compare_sides(shared, costs(shared, unseen) if cost else None, 0.05, 0.1)
@@ -119,7 +119,7 @@ def pair(seed: int) -> dict[str, Gate]:
     for name, distance in {"old": 4.0, "near": 4.0001}.items():
         Path(f"{name}.yaml").write_text(f"max_correspondence_distance: {distance}\n")
 
-    def driven(given: str) -> tuple[Side, Side]:
+    def driven(given: str) -> tuple[OfflineStudy, OfflineStudy]:
         return sides((given, "old.yaml"), Asked([bag], ODOMETRY), None, unseen)
 
     new, old = driven("near.yaml")

@@ -26,16 +26,16 @@ from pathlib import Path
 import numpy as np
 from reading import cloud, write
 
-from adaptune import machine, yaml12
+from adaptune._system import machine, yaml12
 from adaptune.bank.bank import Bank
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
+from adaptune.runs.loop import replay
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.trajectory import Trajectory, write_tum
-from online.replay import replay
 
 TURN = 200
 """Scans after which the robot goes back."""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import machine
+from adaptune._system import machine
 from adaptune.live.evidence import LiveEvidence
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.health import HealthCheck

@@ -1,8 +1,8 @@
-"""What stretches save of the CPU time of `adaptune offline` on one long recording.
+"""What segments save of the CPU time of `adaptune offline` on one long recording.
 
     python benchmarks/long_drive.py RECORDING.bag [--seconds 180] [--sets 16] [--length 4.0]
 
-It trains GICP twice in this process, on twelve stretches and on all of the recording's begin, and
+It trains GICP twice in this process, on twelve segments and on all of the recording's begin, and
 prints for each: CPU seconds of all, and of these of drives, of descriptions, and of hops; scans
 that were registered; the fixed set, and its error in percent over all of it. CPU time hardly
 depends on what else the machine does.
@@ -16,8 +16,8 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Self
 
-from adaptune import yaml12
-from adaptune.archive import Archive
+from adaptune._system import yaml12
+from adaptune.runs.archive import Archive
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence
 from offline import train as training
@@ -63,7 +63,7 @@ def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         found = function(*args, **more)
         spent[function.__name__] += time.process_time() - begin  # type: ignore[assignment]
         if function.__name__ == "drive_sets":
-            spent["scans"] += sum(int(drive.tried.sum()) for of in found for drive in of)
+            spent["scans"] += sum(len(run.steps) for of in found for run in of)
         return found
 
     return call
@@ -92,17 +92,17 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "long.yaml"
         file.write_text(yaml12.dump(about), "utf-8")
-        for stretches in ("12", "all"):
-            study = load_study(file, [f"offline.stretches={stretches}"], Path(folder) / stretches)
+        for segments in ("12", "all"):
+            study = load_study(file, [f"offline.segments={segments}"], Path(folder) / segments)
             n = sum(1 for _ in study.sequences.open("long"))  # it is in the cache from now on
             spent.clear()
             begin = time.process_time()
             found = training.train(study)
             seconds, archive = time.process_time() - begin, Archive(study.folder / "trials")
-            error = archive.summary("long", found.model.fixed, whole=True).mean_error
+            error = archive.summary("long", found.model.fixed, kind="whole").mean_error
             driven = archive.read_frames("long").n_driven / n
             parts = "  ".join(f"{name} {value:.1f}" for name, value in sorted(spent.items()))
-            print(f"stretches {stretches:3}  {n} scans, {driven:.2f} driven  all {seconds:.1f} s")
+            print(f"segments {segments:3}  {n} scans, {driven:.2f} driven  all {seconds:.1f} s")
             print(f"    {parts}  fixed {found.model.fixed}: {error:.4f} %", flush=True)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import small_gicp
 
-from adaptune import machine, open3d
+from adaptune._system import machine, open3d
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.base import InProcess, OdometryInstance

@@ -10,7 +10,7 @@ Each recording is left out in turn. Once a second one of the sets is chosen, by 
   as GenZ-LIO does. Of several set points, the one that is cheapest in training and there no worse
   than the fixed set.
 
-The script prints the error to the fixed set's on what is left out (geometric mean over stretches,
+The script prints the error to the fixed set's on what is left out (geometric mean over segments,
 and the worst one), and CPU time. A set's cost in a place follows from its number of points there,
 by a straight line through the costs of all sets on all recordings. Errors are those of the trials:
 a switch costs nothing.
@@ -23,13 +23,13 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive
 from adaptune.metrics import cap
 from adaptune.model.rules import ERROR_FLOOR, N_FRAMES, SHARPNESS, NearestFrames
+from adaptune.runs.archive import Archive
 from adaptune.space import ParameterSets
+from offline.bank_choice import log_ratios
 from offline.config import OfflineStudy, load_study
 from offline.labelled import LabelledData, LabelledSequence, labelled_data, periods
-from offline.tuning import log_ratios
 
 Counts = dict[str, NDArray[np.float64]]
 """By sequence, points after downsampling by each set, at the first scan of each period."""
@@ -109,9 +109,9 @@ class Outcome:
     ) -> None:
         """Add a sequence; `ms` is of shape (n_periods, n_sets)."""
         _, period = periods(s.simulation.period)
-        capped, period = cap(s.errors), period[s.known]
-        errors = capped[np.arange(len(capped)), chosen[period]]
-        self.logs += log_ratios(errors, capped[:, fixed], s.stretch).tolist()
+        clipped, period = cap(s.errors), period[s.known]
+        errors = clipped[np.arange(len(clipped)), chosen[period]]
+        self.logs += log_ratios(errors, clipped[:, fixed], s.segment).tolist()
         cost = ms[np.arange(len(ms)), chosen].mean()
         self.costs.append(cost)
         self.saved.append(np.log(cost / ms[:, fixed].mean()))

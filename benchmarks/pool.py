@@ -29,23 +29,24 @@ from numpy.typing import NDArray
 from pool_data import LENGTH, pool, pooled_data, run_course
 from replays import ORDERS, mean_error
 
+from adaptune._system.processes import server
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.remote import SERVICE
-from adaptune.processes import server
 from adaptune.recording.scan import Scan
+from adaptune.runs.loop import replay
+from adaptune.runs.record import Run
 from adaptune.selector import Selector
 from adaptune.simulation import Course
 from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import named
+from offline.bank_choice import figures
 from offline.labelled import LabelledData
-from offline.train import fit, tuned
-from offline.tuning import figures
+from offline.train import fit, with_bank
 from offline.validate import Validation, leave_one_out
-from online.replay import ReplayRecord, replay
 
 DRIVEN_LENGTH = 40.0
 """Metres of each scene that is driven through."""
@@ -96,10 +97,10 @@ def _words(ratio: NDArray[np.float64]) -> str:
 def model_of(data: LabelledData) -> ErrorModel:
     """The error model with its bank."""
     model = fit(data, data.fixed(), pool().identity, 25.0, WINDOW, {})
-    return tuned(model, data, SwitchingConfig())
+    return with_bank(model, data, SwitchingConfig())
 
 
-def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, ReplayRecord]]:
+def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, Run]]:
     """Replay a course in all modes; the mean error in percent and the replay of each."""
     scans, make = list(simulate(course)), pool()
     trials = {"baseline": 0, "fixed": model.fixed}
@@ -115,7 +116,7 @@ def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, ReplayRec
     return found
 
 
-def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> ReplayRecord:
+def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> Run:
     """Replay scans with the model's bank."""
     sets = {trial: model.sets[trial] for trial in model.bank}
     bank = Bank(pool(), sets)

@@ -21,8 +21,7 @@ from gain_data import (
 )
 from numpy.typing import NDArray
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
-from adaptune.files import replacing
+from adaptune._system.files import replacing
 from adaptune.live.hops import Hops
 from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
@@ -30,6 +29,7 @@ from adaptune.model.rules import Costs, SetCost
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
+from adaptune.runs.archive import PREPARE_MS, REGISTER_MS, Frames
 from adaptune.simulation.record import simulate
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, ParameterSpace
 from offline.drive import TrialSetup
@@ -129,8 +129,8 @@ def _write(
             errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
             vectors=np.stack(vectors, axis=1),
             motions=motions.astype(np.float32),
-            register_ms=[trial.usage[REGISTER_MS] for trial in trials],
-            prepare_ms=[trial.usage[PREPARE_MS] for trial in trials],
+            register_ms=[trial.others[REGISTER_MS] for trial in trials],
+            prepare_ms=[trial.others[PREPARE_MS] for trial in trials],
             evidence_ms=frames.evidence_ms,
             **{f"hops_{name}": array for name, array in frames.hops._asdict().items()},
         )

@@ -43,8 +43,9 @@ from portfolio_data import (
 )
 from scipy import stats
 
-from adaptune import __version__, machine
-from adaptune.files import replacing, write_text
+from adaptune import __version__
+from adaptune._system import machine
+from adaptune._system.files import replacing, write_text
 from adaptune.metrics import LOST_ABOVE
 from adaptune.odometry.portfolio import FOLDER, Member, Portfolio
 from adaptune.space import ParameterSet

@@ -18,9 +18,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 from made_drives import trials_of
 
-from adaptune import yaml12
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
-from adaptune.files import replacing, write_text
+from adaptune._system import yaml12
+from adaptune._system.files import replacing, write_text
 from adaptune.geometry import invert
 from adaptune.metrics import travelled
 from adaptune.odometry.factory import OdometryFactory
@@ -30,6 +29,7 @@ from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.recording.compensation import compensate, compensate_neighbours
 from adaptune.recording.scan import Scan
+from adaptune.runs.archive import Frames
 from adaptune.simulation import Course
 from adaptune.simulation.course import MOTIONS
 from adaptune.simulation.record import SimulatedDrive, SimulatedScan
@@ -72,7 +72,7 @@ class Place:
     kind: ScanKind
     recorded: bool
     begin: NDArray[np.float64]  # (n_blocks,): where each block begins, as a share of the scans
-    errors: NDArray[np.float64]  # (n_blocks, n_sets): mean capped error in percent
+    errors: NDArray[np.float64]  # (n_blocks, n_sets): mean clipped error in percent
     costs: NDArray[np.float64]  # (n_sets,): ms of CPU time a scan
     restarts: NDArray[np.float64]  # (n_sets,): infinite for a set that failed
 
@@ -194,7 +194,7 @@ def drive_sets(
         recorded,
         known[first] / n,
         block_means(errors[known], block),
-        np.array([trial.usage[REGISTER_MS] + trial.usage[PREPARE_MS] for trial in trials]),
+        np.array([trial.cost for trial in trials]),
         np.array([np.inf if t.failure else float(t.restarted.sum()) for t in trials]),
     )
 

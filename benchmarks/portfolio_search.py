@@ -25,11 +25,11 @@ from portfolio import TABLES, as_text, left_out, portfolio, within_budget, writt
 from portfolio_data import OF_RECORDINGS, Place, read_places, sets_of
 from recorded import CARS, RECORDINGS, Direction, definition
 
-from adaptune import machine, yaml12
-from adaptune.files import write_text
+from adaptune._system import machine, yaml12
+from adaptune._system.files import write_text
+from adaptune._system.progress import unseen
 from adaptune.metrics import cap
 from adaptune.odometry.portfolio import read_portfolio
-from adaptune.progress import unseen
 from adaptune.report import tables
 from adaptune.study.references import ensure_references
 from offline.config import OfflineStudy, load_study

@@ -17,8 +17,8 @@ from replays import bank_of, mean_error, model_of, of_world, replays_of
 
 from adaptune.metrics import cap
 from adaptune.simulation.record import simulate
+from offline.bank_choice import Policy, bank_errors
 from offline.labelled import LabelledData, LabelledSequence
-from offline.tuning import Policy, bank_errors
 
 BOUND = 1.1
 

@@ -218,7 +218,7 @@ PROTOCOLS = MappingProxyType(
         ),
         "docker": Protocol(
             "garden_docker",
-            overrides=("offline.objective=rpe", "offline.stretches=all"),
+            overrides=("offline.objective=rpe", "offline.segments=all"),
             variants=samplers(DOCKER_GRID),
             simulated=True,
             sets=19,

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import machine
+from adaptune._system import machine
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import lowest_elevation
@@ -38,14 +38,13 @@ from adaptune.odometry.remote import Limits
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
+from adaptune.runs.loop import replay
 from adaptune.selector import Selector, untrained_sets
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
 from adaptune.study.config import RealTimeConfig
 from online.real_time import replay_in_real_time
-from online.record import kept_up
-from online.replay import replay
 from online.selector_process import SelectorProcess
 
 REPEATS = 5
@@ -138,7 +137,7 @@ def in_real_time(scans: list[Scan]) -> None:
     make = partial(Selector, model_of(scans), "adaptive", ())
     with closing(SelectorProcess(make, 1.0)) as selector:
         found = replay_in_real_time(scans, GICP(), HealthCheck(), RealTimeConfig(), selector)
-    print(f"real time, {len(scans)} scans: {kept_up(found)}", flush=True)
+    print(f"real time, {len(scans)} scans: {found.summary.real_time}", flush=True)
 
 
 def main() -> None:

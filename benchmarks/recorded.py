@@ -41,12 +41,12 @@ from typing import Any
 
 import numpy as np
 
-from adaptune import machine, yaml12
+from adaptune._system import machine, yaml12
+from adaptune._system.files import write_text
+from adaptune._system.progress import unseen
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
 from adaptune.metrics import cap, sub_trajectory_turns
 from adaptune.model.rules import BASELINE, Costs
-from adaptune.progress import unseen
 from adaptune.recording.config import ESTIMATED, part_name, read_part
 from adaptune.report import tables
 from adaptune.space import ParameterSets
@@ -163,8 +163,8 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
     rows: list[ComparisonRow] = []
     for name in study.config.test:
         stored = Replays.of(study)
-        also = [m for m in study.config.online.also if m in stored.made(name)]
-        replays = {mode: stored.read(name, mode) for mode in (*MODES, *also)}
+        modes = [m for m in (*MODES, *study.config.online.also) if m in stored.made(name)]
+        replays = {mode: stored.read(name, mode) for mode in modes}
         reference = read_reference(study, name)
         rows += compare_modes(name, replays, reference).rows
     return rows
@@ -198,7 +198,7 @@ def table_lines(rows: Sequence[ComparisonRow]) -> list[str]:
                 continue
             low, high = row.ratio_interval or (np.nan, np.nan)
             times = "" if row.mode == "fixed" else f" = {row.ratio:.2f} ({low:.2f}-{high:.2f})"
-            restarts = f", {row.restarts} restarts" if row.restarts else ""
+            restarts = f", {row.run.restarts} restarts" if row.run.restarts else ""
             cells.append(f"{row.mode} {row.rte:.3f} %{times}{restarts}")
         lines.append("   ".join(cells))
     return lines
@@ -230,7 +230,7 @@ def driven(given: argparse.Namespace, name: str) -> LabelledData:
     estimated = given.no_reference or name in CARS
     defined = definition(direction, "gicp", given.sets, given.seed, estimated)
     defined["offline"] = {"initial": given.sets, "trials": given.sets, "seed": given.seed}
-    defined["offline"] |= {"stretches": "all", "workers": 1}
+    defined["offline"] |= {"segments": "all", "workers": 1}
     folder = given.folder / name.partition(":")[0]
     write_text(path := folder.with_suffix(".yaml"), yaml12.dump(defined))
     study = load_study(path, folder=folder)
@@ -240,9 +240,9 @@ def driven(given: argparse.Namespace, name: str) -> LabelledData:
     archive.begin()
     with trial_workers(study, study.training, None) as workers:
         run_baseline(study, archive, workers, unseen)
-        verdicts = Campaign(study, archive, workers).run()
-    tried = tuple(verdict.parameters for verdict in verdicts.values())
-    sets = ParameterSets(study.odometry.space, tuple(verdicts), tried)
+        judged = Campaign(study, archive, workers).run()
+    tried = tuple(one.parameters for one in judged.values())
+    sets = ParameterSets(study.odometry.space, tuple(judged), tried)
     data = labelled_data(study, archive, sets)
     (one,) = data.sequences
     T_ref_sensor, paths = one.simulation.T_ref_sensor, [archive.read(one.name, n) for n in sets]

@@ -23,7 +23,7 @@ from gain_modes import print_summary
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from adaptune.files import replacing
+from adaptune._system.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.estimate import VERSION, estimated
@@ -32,8 +32,8 @@ from adaptune.reference.graph import pass_over
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from offline import validate as validation
+from offline.bank_choice import choose
 from offline.labelled import LabelledData, chained
-from offline.tuning import choose
 from offline.validate import LeftOut, Validation
 
 LENGTH = 25.0
@@ -85,7 +85,7 @@ class Judged(NamedTuple):
     """A course as the truth and the estimate judge it."""
 
     name: str
-    errors: NDArray[np.float64]  # (2, n_sets): mean capped errors by truth, by the estimate
+    errors: NDArray[np.float64]  # (2, n_sets): mean clipped errors by truth, by the estimate
     wrong: float  # mean error of the estimate
     says: float  # what it says of that
     arrays: dict[str, Any]  # of the file of trials, with the estimate in place of the truth

@@ -29,14 +29,15 @@ from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.health import HealthCheck
 from adaptune.recording.scan import Scan
+from adaptune.runs.loop import replay
+from adaptune.runs.record import Run
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.simulation import Course
 from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.space import Selection
+from offline.bank_choice import Policy, choose
 from offline.labelled import LabelledData
 from offline.train import fit
-from offline.tuning import Policy, choose
-from online.replay import ReplayRecord, replay
 
 ORDERS = (
     ("cave", "open", "street"),
@@ -140,7 +141,7 @@ def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, W
     return {name: make() for name, make in made.items() if name == "fixed" or name in modes}
 
 
-def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[ReplayRecord]:
+def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[Run]:
     """Replay a course in all ways."""
     replays = []
     for make, selector in compared.values():
@@ -150,8 +151,8 @@ def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[
     return replays
 
 
-def mean_error(scans: list[SimulatedScan], result: ReplayRecord) -> float:
-    """Mean capped error of a replay in percent."""
+def mean_error(scans: list[SimulatedScan], result: Run) -> float:
+    """Mean clipped error of a replay in percent."""
     T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
     errors = sub_trajectory_rte(T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY)
     return float(cap(errors[~np.isnan(errors)]).mean())

@@ -3,7 +3,7 @@
     adaptune trials runs/toy_gicp --errors errors.csv
     python benchmarks/rules.py errors.csv [--seed 0]
 
-Each fold of the table, a recording or a stretch of one, is left out in turn. The script prints for
+Each fold of the table, a recording or a segment of one, is left out in turn. The script prints for
 each rule its mean RTE, the geometric mean over the folds of its ratio to the fixed set's, a 95 %
 interval of that (bootstrap over folds), and its worst fold. `hindsight` is the best single set of
 each fold, which no rule knows.
@@ -24,7 +24,7 @@ RESAMPLES = 2000
 
 
 def scores(table: Scenario) -> dict[str, NDArray[np.float64]]:
-    """Capped errors of each rule at every frame, of shape (n,)."""
+    """Clipped errors of each rule at every frame, of shape (n,)."""
     errors = cap(table.performances)
     hindsight, every = np.empty(len(errors)), np.arange(len(errors))
     for fold in np.unique(table.fold):

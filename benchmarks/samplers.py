@@ -32,11 +32,11 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 from made_drives import trials_of
 
-from adaptune import machine
-from adaptune.archive import Frames
+from adaptune._system import machine
 from adaptune.report import tables
 from adaptune.report.charts import Axis, Band, Chart, Drawn, Line, Panel
 from adaptune.report.drawing import draw_chart
+from adaptune.runs.archive import Frames
 from adaptune.simulation.record import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig, load_study

@@ -22,17 +22,19 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import drives
+from made_trials import run_along
 from rooms import along_x
 
-from adaptune.archive import Archive, Frames
-from adaptune.progress import unseen
+from adaptune._system.progress import unseen
+from adaptune.runs.archive import Archive, Frames
+from adaptune.runs.record import Run
 from adaptune.space import ParameterSet
 from offline import campaign
-from offline.campaign import Campaign, drive_whole, run_baseline
+from offline.campaign import Campaign, run_baseline
 from offline.choice import FINALISTS
 from offline.config import load_study
-from offline.drive import Drive
-from offline.stretches import Stretch, stretches_of
+from offline.frames import Segment, segments_of
+from offline.whole import drive_whole
 from offline.workers import Result, Task
 
 CASES = {
@@ -62,9 +64,9 @@ def prepare_seconds(parameters: Mapping[str, Any]) -> float:
 class Made:
     """A pool of `n` workers with a clock of their own."""
 
-    def __init__(self, n: int, scans: Mapping[str, int], kept: float, stretches: int | None):
+    def __init__(self, n: int, scans: Mapping[str, int], kept: float, segments: int | None):
         self.n, self.now, self.busy = n, 0.0, 0.0
-        self._scans, self._most, self._stretches = scans, kept, stretches
+        self._scans, self._most, self._segments = scans, kept, segments
         self._running: list[tuple[float, int, int, Result]] = []
         self._begun = 0
         self._kept: list[dict[Any, int]] = [{} for _ in range(n)]
@@ -89,35 +91,31 @@ class Made:
         n = self._scans[task.sequence]
         if task.frames is not None:
             return HOPS * n, replace(task.frames, evidence_ms=1e3 * HOPS)
-        if task.stretch is None:
+        if task.segment is None:
             T_ref_sensor, stamps = along_x(STEP * np.arange(n)), np.arange(n) * 10**8
-            stretches = stretches_of(T_ref_sensor, stamps, LENGTH, self._stretches)
+            segments = segments_of(T_ref_sensor, stamps, LENGTH, self._segments)
             seen = (np.zeros((n, 90), np.float32), {"ndt": 90}, np.zeros(n, np.float32))
-            return DESCRIBE * n, Frames(stamps, T_ref_sensor, *seen, stretches=stretches)
+            return DESCRIBE * n, Frames(stamps, T_ref_sensor, *seen, segments=segments)
         seconds, fresh, kept = 0.0, set(), self._kept[worker]
-        n = len(task.stretch.stamps)
+        n = len(task.segment.stamps)
         for parameters in task.sets.values():
             seconds += align_seconds(parameters) * n
-            key = (task.stretch.key, density := parameters["downsampling"])
+            key = (task.segment.key, density := parameters["downsampling"])
             if key not in kept and density not in fresh:
                 seconds += prepare_seconds(parameters) * n
                 fresh.add(density)
                 if sum(kept.values()) + n <= self._most:
                     kept[key] = n
-        return seconds, {i: [_drive(task.stretch, one)] for i, one in task.sets.items()}
+        return seconds, {i: [_drive(task.segment, one)] for i, one in task.sets.items()}
 
 
-def _drive(stretch: Stretch, parameters: ParameterSet) -> Drive:
-    """A drive with some error."""
-    drive, given = Drive.lost(stretch), dict[str, Any](parameters)
+def _drive(segment: Segment, parameters: ParameterSet) -> Run:
+    """A run with some error."""
+    given, n = dict[str, Any](parameters), len(segment.stamps)
     off = abs(np.log(given["max_correspondence_distance"] / 2.0)) + 0.3 * given["downsampling"]
-    drive.T_odom_sensor = along_x(STEP * (1.003 + 0.01 * off) * np.arange(len(drive.tried)))
-    drive.registered[:] = drive.tried[:] = True
-    drive.without_pose[:] = False
-    drive.seconds[1:] = align_seconds(given)
-    cpu = align_seconds(given) * len(drive.tried)
-    drive.usage = drive.usage._replace(cpu=cpu)
-    return drive
+    run = run_along(segment.stamps, STEP * (1.003 + 0.01 * off), align_seconds(given))
+    run.usage = run.usage._replace(cpu=align_seconds(given) * n)
+    return run
 
 
 def run(n: int, scans: Mapping[str, int], trials: int, kept: float) -> list[float]:
@@ -128,13 +126,13 @@ def run(n: int, scans: Mapping[str, int], trials: int, kept: float) -> list[floa
         given += ["odometry={name: gicp}", f"offline={{trials: {trials}}}"]
         study = load_study(file, given, Path(temporary) / "study")
         study.folder.mkdir()
-        pool, archive = Made(n, scans, kept, study.config.stretches), Archive(study.folder / "t")
+        pool, archive = Made(n, scans, kept, study.config.segments), Archive(study.folder / "t")
         run_baseline(study, archive, pool, unseen)
         ends = [pool.now]
-        verdicts = Campaign(study, archive, pool).run()
+        judged = Campaign(study, archive, pool).run()
         ends.append(pool.now)
-        best = sorted(verdicts, key=lambda number: verdicts[number].value)[:FINALISTS]
-        sets = {number: verdicts[number].parameters for number in sorted({0, *best})}
+        best = sorted(judged, key=lambda number: judged[number].value)[:FINALISTS]
+        sets = {number: judged[number].parameters for number in sorted({0, *best})}
         drive_whole(study, sets, archive, pool, unseen)
         ends.append(pool.now)
         return [*np.diff(ends, prepend=0.0).tolist(), pool.now, pool.busy / pool.now / n]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
-from adaptune import machine
+from adaptune._system import machine
 from adaptune.model import (
     BankRule,
     ErrorModel,

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune import yaml12
-from adaptune.machine import resident_megabytes
+from adaptune._system import yaml12
+from adaptune._system.machine import resident_megabytes
 from adaptune.recording.scan import Scan
+from adaptune.runs.record import Run
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from offline.config import load_study
-from online.replay import ReplayRecord
 from online.robot import RobotDrive
 
 RATE = 10.0
@@ -142,7 +142,7 @@ def main(folder: Path, hours: float) -> None:
     megabytes: list[float] = []
     begin = time.perf_counter()
 
-    def watch(at: ReplayRecord) -> None:
+    def watch(at: Run) -> None:
         robot.free.release()
         if at.done % round(EVERY * RATE) == 0:
             seconds.append(at.done / RATE)
@@ -155,10 +155,10 @@ def main(folder: Path, hours: float) -> None:
         if at.done == n:
             drive.stop()
 
-    driven = drive.run(robot, watch)
+    drive.run(robot, watch)
     late = len(seconds) // 4
     slope = 3600.0 * np.polyfit(seconds[late:], megabytes[late:], 1)[0]
-    print(f"{driven.scans} scans; {slope:+.1f} MB an hour over the last three quarters (limit 5)")
+    print(f"{drive.done} scans; {slope:+.1f} MB an hour over the last three quarters (limit 5)")
 
 
 if __name__ == "__main__":

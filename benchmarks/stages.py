@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import small_gicp
 
-from adaptune import machine
+from adaptune._system import machine
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel
@@ -27,17 +27,16 @@ from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import crop
 from adaptune.recording import SequenceConfig
 from adaptune.recording.recording import open_sequence
+from adaptune.runs.loop import replay
+from adaptune.runs.record import Run
 from adaptune.selector import Selector
 from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import read_kitti
 from offline.config import OfflineStudy, load_study
-from offline.drive import TrialSetup, drive_sets
-from offline.frames import describe
+from offline.drive import TrialSetup, drive_sets, trial_of
+from offline.frames import describe, segments_along
 from offline.shared_scans import SharedScans
-from offline.stretches import stretches_along
 from offline.train import train
-from offline.trial import trial_of
-from online.replay import ReplayRecord, replay
 
 REPETITIONS = 5
 UNCACHED = [f"sequences.{name}.cache=false" for name in ("hall_begin", "hall_end", "street")]
@@ -91,16 +90,16 @@ def trial(study: OfflineStudy) -> None:
     """One trial over prepared scans."""
     setup = TrialSetup(study.config, study.odometry, study.sequences)
     frames = describe(study.config, study.sequences, "hall_begin").uncut
-    (stretch,) = stretches_along("hall_begin", frames)
+    (segment,) = segments_along("hall_begin", frames)
     shared, read = SharedScans(8e9), study.sequences.open("hall_begin")
     parameters: ParameterSet = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
     instance = study.odometry(parameters)
-    scans = (load(instance) for load in shared.along(stretch, read))
+    scans = (load(instance) for load in shared.along(segment, read))
     prepared = [(scan.cloud, scan.tree) for scan in scans]
     iterations = study.odometry.settings.iterations
 
     def ours() -> None:
-        (drives,) = drive_sets(setup, shared, read, stretch, [parameters])
+        (drives,) = drive_sets(setup, shared, read, segment, [parameters])
         trial_of(study.config, parameters, frames, {0: drives})
 
     compare(
@@ -128,7 +127,7 @@ def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
     street = study.sequences.open("street")
     settings = study.odometry.settings
 
-    def replayed(selector: Selector) -> ReplayRecord:
+    def replayed(selector: Selector) -> Run:
         selector.reset()
         return replay(street, study.odometry(fixed), HealthCheck(), selector)
 

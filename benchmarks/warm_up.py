@@ -3,7 +3,7 @@
     python benchmarks/warm_up.py RECORDING.bag ODOMETRY...
 
 Each odometry drives the whole recording once, and then begins anew in the middle of it, again and
-again, as a trial begins at a stretch. The error over the next 2.5 m is divided by that of the drive
+again, as a trial begins at a segment. The error over the next 2.5 m is divided by that of the drive
 through, on the same frames. Columns: what is driven, then by metres since the beginning, and by
 seconds since then, the mean error of what began there / that of the drive through. The baseline,
 and on request some random sets.
@@ -20,18 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import yaml12
-from adaptune.archive import Frames
+from adaptune._system import yaml12
+from adaptune._system.strict import ConfigurationError
 from adaptune.geometry import Poses
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
+from adaptune.runs.archive import Frames
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence
 from adaptune.space import ParameterSet
-from adaptune.strict import ConfigurationError
 from offline.config import OfflineStudy, load_study
 from offline.drive import TrialSetup, drive_sets
+from offline.frames import segments_along
 from offline.shared_scans import SharedScans
-from offline.stretches import stretches_along
 
 WINDOW = 2.5
 """Metres of a sub-trajectory."""
@@ -74,18 +74,18 @@ def ratios(
 ) -> tuple[list[float], list[float], float]:
     """Errors to those of drives through by metres and by seconds, and the latter in percent."""
     scans = setup.sequences.open("one")
-    (whole,) = stretches_along("one", frames.uncut)
+    (whole,) = segments_along("one", frames.uncut)
     driven = drive_sets(setup, SharedScans(4e9), scans, whole, sets)
-    through = [drive.T_odom_sensor for (drive,) in driven]
+    through = [run.trajectory.T_world_sensor for (run,) in driven]
     metres, seconds = travelled(frames.T_ref_sensor), (frames.stamps - frames.stamps[0]) * 1e-9
     of_through = [cap(sub_trajectory_rte(frames.T_ref_sensor, T, WINDOW)) for T in through]
     rows = []  # metres, seconds, error, that of the drive through
-    for stretch in stretches_along("one", frames):
-        part = slice(stretch.first, stretch.first + len(stretch.stamps))
-        T_ref_sensor, begin = frames.T_ref_sensor[part], stretch.first
-        driven = drive_sets(setup, SharedScans(2e9), scans, stretch, sets)
-        for (drive,), errors in zip(driven, of_through, strict=True):
-            began = cap(sub_trajectory_rte(T_ref_sensor, drive.T_odom_sensor, WINDOW))
+    for segment in segments_along("one", frames):
+        part = slice(segment.first, segment.first + len(segment.stamps))
+        T_ref_sensor, begin = frames.T_ref_sensor[part], segment.first
+        driven = drive_sets(setup, SharedScans(2e9), scans, segment, sets)
+        for (run,), errors in zip(driven, of_through, strict=True):
+            began = cap(sub_trajectory_rte(T_ref_sensor, run.trajectory.T_world_sensor, WINDOW))
             since = metres[part] - metres[begin], seconds[part] - seconds[begin]
             rows.append(np.stack([*since, began, errors[part]], axis=1))
     table = np.concatenate(rows)
@@ -135,9 +135,9 @@ def row(given: argparse.Namespace, name: str, folder: Path) -> None:
         sys.exit(f"{given.recording}: has no /gt_poses")
     stamps = np.array([scan.stamp for scan in scans])
     T_ref_sensor, n = reference.at(stamps), len(stamps)
-    stretches = beginnings(T_ref_sensor, stamps, given.begin)
+    segments = beginnings(T_ref_sensor, stamps, given.begin)
     none = np.zeros((n, 0), np.float32), {}, np.zeros(n, np.float32)
-    frames = Frames(stamps, T_ref_sensor, *none, stretches=stretches)
+    frames = Frames(stamps, T_ref_sensor, *none, segments=segments)
     space, rng = study.odometry.space, np.random.default_rng(0)
     sets = [space.baseline, *space.from_unit(rng.random((given.sets - 1, len(space))))]
     setup = TrialSetup(study.config, study.odometry, study.sequences)

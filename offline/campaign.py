@@ -2,29 +2,27 @@
 
 import logging
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial
+from adaptune._system.progress import Progress, about, unseen
 from adaptune.errors import AdaptuneError
 from adaptune.live.hops import Hops
-from adaptune.model.rules import BASELINE
-from adaptune.progress import Progress, about, unseen
 from adaptune.reference.carried import begin_of, left_out
+from adaptune.runs.archive import REGISTER_MS, Archive, Frames, Kind, Trial
+from adaptune.runs.record import Run
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.choice import FINALISTS, OTHERS
 from offline.config import OfflineStudy
-from offline.drive import Drive
-from offline.objective import Verdict, label
+from offline.drive import trial_of
+from offline.frames import Segment, segments_along, segments_of
+from offline.objective import JudgedSet, label
 from offline.search import ELAPSED, TIME_IS_UP, Search, Stopwatch
-from offline.stretches import Stretch, stretches_along, stretches_of
-from offline.trial import trial_of
 from offline.workers import Pool, Result, Task, TaskProgress, run
 
 _log = logging.getLogger(__name__)
@@ -38,17 +36,16 @@ class _Due:
     """A trial that is being driven on a sequence."""
 
     parameters: ParameterSet
-    left: int = 0  # stretches that are not driven yet
+    left: int = 0  # segments that are not driven yet
     share: float = 0.0  # of its scans that are
-    drives: dict[int, Sequence[Drive]] = field(default_factory=dict)  # by first scan
+    runs: dict[int, Sequence[Run]] = field(default_factory=dict)  # by first scan
 
 
 class Schedule:
-    """Trials on sequences, each driven stretch by stretch, by whoever holds the prepared scans.
+    """Trials on sequences, each driven segment by segment, by whoever holds the prepared scans.
 
     A sequence that is not described yet is described first, and the hops along it are measured
-    when there is nothing else to do. With `whole`, whole recordings are driven; with `bare`, they
-    are driven without the health check.
+    when there is nothing else to do.
     """
 
     def __init__(
@@ -57,23 +54,22 @@ class Schedule:
         archive: Archive,
         what: str,
         progress: Progress = unseen,
-        whole: bool = False,
-        bare: bool = False,
+        kind: Kind = "",
         measure: bool = True,
     ):
         self.most_ms: Mapping[str, float] = {}  # of CPU time a scan, above which a set is stopped
         self.done = 0  # trials on sequences
         self._archive, self._what, self._progress = archive, what, progress
-        self._whole, self._bare, self._measure = whole or bare, bare, measure
+        self._kind, self._measure = kind, measure
         self._config, self._odometry = study.config, study.odometry
         self._described: dict[str, Frames] = {}
-        self._frames: dict[str, Frames] = {}  # the same, with the stretches that are driven
+        self._frames: dict[str, Frames] = {}  # the same, with the segments that are driven
         self._unread: list[str] = []
         self._unmeasured: list[str] = []
         self._unsaved: set[str] = set()  # whose frames the archive does not have
         self._due: dict[str, dict[int, _Due]] = {}
-        self._stretches: dict[Hashable, Stretch] = {}
-        # By stretch and preparation of its scans, the sets that are still to be driven there.
+        self._segments: dict[Hashable, Segment] = {}
+        # By segment and preparation of its scans, the sets that are still to be driven there.
         self._waiting: dict[tuple[Hashable, Hashable], dict[int, ParameterSet]] = {}
         self._partly: dict[Hashable, float] = {}  # by task, how much of it is done
 
@@ -111,7 +107,7 @@ class Schedule:
     def store(self, name: str, number: int, trial: Trial) -> None:
         """Store a trial, and before it what all on the sequence share: which scans are driven."""
         self._save(name)
-        self._archive.write(name, number, trial, self._whole, self._bare)
+        self._archive.write(name, number, trial, self._kind)
 
     def frames(self, name: str) -> Frames:
         """What all trials on a sequence share."""
@@ -121,13 +117,13 @@ class Schedule:
         """Let the reference be unknown at these scans, (n,); it counts for drives from now on."""
         frames, config = self._described[name], self._config
         T = np.where(lost[:, None, None], np.nan, frames.T_ref_sensor)
-        some = stretches_of(T, frames.stamps, config.sub_trajectory, config.stretches)
+        some = segments_of(T, frames.stamps, config.sub_trajectory, config.segments)
         # The hops along them are measured again.
         frames = replace(
-            frames, T_ref_sensor=T, stretches=some, hops=Hops.of([]), evidence_ms=np.nan
+            frames, T_ref_sensor=T, segments=some, hops=Hops.of([]), evidence_ms=np.nan
         )
         self._described[name] = frames
-        self._frames[name] = frames.uncut if self._whole else frames
+        self._frames[name] = frames.uncut if self._kind else frames
         self._unsaved.add(name)
 
     def close(self) -> None:
@@ -151,25 +147,27 @@ class Schedule:
             return key not in held, key not in held and key in others, min(self._waiting[key])
 
         key = min(self._waiting, key=rank)
-        waiting, stretch = self._waiting[key], self._stretches[key[0]]
+        waiting, segment = self._waiting[key], self._segments[key[0]]
         # Of a search, some are left for the time when the next sets wait.
-        size = math.ceil(len(waiting) / max(1 if self._whole else 2, n / len(self._waiting)))
+        size = math.ceil(len(waiting) / max(1 if self._kind else 2, n / len(self._waiting)))
         numbers = sorted(waiting)[: 1 if self._odometry.one_by_one else size]
         sets = {number: waiting.pop(number) for number in numbers}
         if not waiting:
             del self._waiting[key]
-        name, n_scans = stretch.sequence, len(stretch.stamps)
-        most_ms, share = self.most_ms.get(name, np.inf), self._share(stretch)
+        name, n_scans = segment.sequence, len(segment.stamps)
+        most_ms, share = self.most_ms.get(name, np.inf), self._share(segment)
         most = max(1e-3 * most_ms * n_scans, LEAST_SECONDS * share)
-        return Task(name, stretch=stretch, sets=sets, most=most, bare=self._bare, prepares=key)
+        return Task(
+            name, segment=segment, sets=sets, most=most, bare=self._kind == "bare", prepares=key
+        )
 
     def note(self, task: Task, progress: TaskProgress) -> None:
         """See `offline.workers.Work`."""
         stage, scans, of = progress
-        if task.stretch is None:
+        if task.segment is None:
             self._progress(f"{stage} {task.sequence}", scans, of, "")
             return
-        share = self._share(task.stretch) * scans / max(of, 1)
+        share = self._share(task.segment) * scans / max(of, 1)
         self._partly[task.key] = share * len(task.sets)
         self._show()
 
@@ -177,7 +175,7 @@ class Schedule:
         measured, self._described[name] = name in self._described, frames
         if measured:
             return
-        self._frames[name] = frames.uncut if self._whole else frames
+        self._frames[name] = frames.uncut if self._kind else frames
         if self._measure and np.isnan(frames.evidence_ms):
             self._unmeasured.append(name)
         for number in self._due[name]:
@@ -186,41 +184,41 @@ class Schedule:
     def _open(self, name: str, number: int) -> None:
         due = self._due[name][number]
         preparation = self._odometry(due.parameters).preparation
-        for stretch in stretches_along(name, self._frames[name]):
-            self._stretches[stretch.key] = stretch
-            self._waiting.setdefault((stretch.key, preparation), {})[number] = due.parameters
+        for segment in segments_along(name, self._frames[name]):
+            self._segments[segment.key] = segment
+            self._waiting.setdefault((segment.key, preparation), {})[number] = due.parameters
             due.left += 1
 
     def _driven(self, task: Task, result: Result) -> Iterator[tuple[str, int, Trial]]:
-        assert task.stretch is not None
+        assert task.segment is not None
         assert not isinstance(result, Frames)
         name = task.sequence
         self._partly.pop(task.key, None)
-        for number, drives in result.items():
+        for number, runs in result.items():
             due = self._due[name][number]
-            due.drives[task.stretch.first] = drives
-            due.share += self._share(task.stretch)
+            due.runs[task.segment.first] = runs
+            due.share += self._share(task.segment)
             due.left -= 1
-            if any(drive.too_slow for drive in drives):
+            if any(run.too_slow for run in runs):
                 due.left -= self._stop(name, number)
             if not due.left:
                 del self._due[name][number]
                 self.done += 1
-                of = (due.parameters, self._frames[name], due.drives)
+                of = (due.parameters, self._frames[name], due.runs)
                 yield name, number, trial_of(self._config, *of)
         self._show()
 
     def _stop(self, name: str, number: int) -> int:
-        """Drive a set no more on a sequence; returns along how many stretches it is not driven."""
+        """Drive a set no more on a sequence; returns along how many segments it is not driven."""
         stopped = 0
-        for key in [key for key in self._waiting if self._stretches[key[0]].sequence == name]:
+        for key in [key for key in self._waiting if self._segments[key[0]].sequence == name]:
             stopped += self._waiting[key].pop(number, None) is not None
             if not self._waiting[key]:
                 del self._waiting[key]
         return stopped
 
-    def _share(self, stretch: Stretch) -> float:
-        return len(stretch.stamps) / self._frames[stretch.sequence].n_driven
+    def _share(self, segment: Segment) -> float:
+        return len(segment.stamps) / self._frames[segment.sequence].n_driven
 
     def _save(self, name: str) -> None:
         if name in self._unsaved:
@@ -237,19 +235,7 @@ class Schedule:
         self._progress(self._what, self.driven, self.total, "")
 
 
-def read_whole_drives(
-    archive: Archive, names: Sequence[str], numbers: Iterable[int], bare: bool = False
-) -> dict[str, dict[int, Summary]]:
-    """By sequence, the drives of whole recordings that there are of some trials, by number."""
-    found: dict[str, dict[int, Summary]] = {name: {} for name in names}
-    for name in names:
-        for n in numbers:
-            with suppress(ArchiveError):
-                found[name][n] = archive.summary(name, n, whole=True, bare=bare)
-    return found
-
-
-COST = 1.4
+USUAL_COST = 1.4
 """Of a set, over the baseline's, about: 1.1 to 1.6 in the mean of the sets on each of five
 recordings."""
 ALONE = 2
@@ -282,16 +268,16 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
     sets that were never tried cannot be in a bank.
     """
     baselines = range(len(study.odometry.space.baselines))
-    drives = read_whole_drives(archive, study.training, baselines)
+    drives = archive.summaries(study.training, baselines)
     costs, each, rest = [], 0.0, 0.0
-    for name, runs in drives.items():
+    for name, trials in drives.items():
         frames = archive.read_frames(name)
-        known = [run.ms if np.isnan(run.cost) else run.cost for run in runs.values()]
+        known = [trial.ms if np.isnan(trial.cost) else trial.cost for trial in trials.values()]
         costs.append(1e-3 * float(np.mean(known)))
-        each += COST * costs[-1] * frames.n_driven * study.config.offline.repeats
+        each += USUAL_COST * costs[-1] * frames.n_driven * study.config.offline.repeats
         if not archive.is_uncut(name):
             n_sets = len(baselines) + FINALISTS + 2 * OTHERS
-            rest += COST * costs[-1] * len(frames.stamps) * n_sets
+            rest += USUAL_COST * costs[-1] * len(frames.stamps) * n_sets
     workers = max(workers, 1)  # those of a cluster may come later
     rest /= workers
     if clock.replays:
@@ -319,7 +305,7 @@ class Campaign:
         progress: Progress = unseen,
         clock: Stopwatch | None = None,
         expected: Forecast = Forecast(0.0, 0.0),  # noqa: B008 (a tuple)
-        tell: Callable[[Mapping[int, Verdict]], None] = lambda _: None,
+        tell: Callable[[Mapping[int, JudgedSet]], None] = lambda _: None,
     ):
         self._workers, self._progress, self._expected = workers, progress, expected
         self._config, self._names = study.config.offline, study.training
@@ -334,11 +320,11 @@ class Campaign:
         self._baselines = range(len(space.baselines))
         self._schedule.most_ms = {
             name: SLOW * max(drive.others.get(REGISTER_MS, np.inf) for drive in drives.values())
-            for name, drives in read_whole_drives(archive, self._names, self._baselines).items()
+            for name, drives in archive.summaries(self._names, self._baselines).items()
             if drives
         }
 
-    def run(self) -> dict[int, Verdict]:
+    def run(self) -> dict[int, JudgedSet]:
         """Run all trials that are not in the archive yet, and judge all of them by number."""
         search = self._search
         self._begin()
@@ -403,47 +389,11 @@ class Campaign:
         self._progress(what, done, of, remark)
 
 
-def drive_whole(
-    study: OfflineStudy,
-    sets: Mapping[int, ParameterSet],
-    archive: Archive,
-    workers: Pool[Any],
-    progress: Progress,
-) -> None:
-    """Drive sets along whole training sequences, unless that was done before.
-
-    Where one is lacking, all drive again: costs compare where they were measured side by side.
-    Where the health check acts, it may hide that a set fails without it. So those sets, and the
-    baseline, drive such sequences once more, bare.
-    """
-    names, labels = study.training, _labels(study)
-
-    def drive(on: Mapping[str, Collection[int]], what: str, bare: bool = False) -> None:
-        schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
-        there = read_whole_drives(archive, names, sets, bare)
-        for name, numbers in on.items():
-            if lacking := {*numbers} - {*there[name]}:
-                for n in sorted(lacking) if bare else numbers:
-                    archive.trial_path(name, n, True, bare).unlink(missing_ok=True)
-                    schedule.add(name, n, sets[n])
-        for name, n, trial in _checked(schedule, workers, [] if bare else labels):
-            schedule.store(name, n, trial)
-
-    drive(dict.fromkeys(names, sets), "whole drives")
-    whole = read_whole_drives(archive, names, sets)
-    restarts = {n: sum(of[n].restarts for of in whole.values()) for n in sets}
-    helped = [n for n in sets if restarts[n] > 0]
-    if not {*helped} - {BASELINE}:
-        return
-    on = {name: [n for n in helped if of[n].restarts] for name, of in whole.items()}
-    drive(on, "drives without health check", bare=True)
-
-
 class BaselineError(AdaptuneError):
     """An odometry that fails with its own parameters."""
 
 
-def _labels(study: OfflineStudy) -> list[str]:
+def labels_of(study: OfflineStudy) -> list[str]:
     """What a study calls its odometries, in the order of their baselines' trials."""
     space = study.odometry.space
     return list(space.spaces) if isinstance(space, PooledSpace) else [study.odometry.name]
@@ -460,9 +410,9 @@ def run_baseline(
     out, and the baseline drives again.
     """
     space = study.odometry.space
-    there = read_whole_drives(archive, study.training, range(len(space.baselines)))
-    labels = _labels(study)
-    schedule = Schedule(study, archive, "baseline", progress, whole=True)
+    there = archive.summaries(study.training, range(len(space.baselines)))
+    labels = labels_of(study)
+    schedule = Schedule(study, archive, "baseline", progress, kind="whole")
     for name in study.training:
         schedule.need(name)
         for number, parameters in enumerate(space.baselines):
@@ -471,7 +421,7 @@ def run_baseline(
     done: dict[tuple[str, int], Trial] = {}
 
     def drive() -> None:
-        for name, number, trial in _checked(schedule, workers, labels):
+        for name, number, trial in checked(schedule, workers, labels):
             done[name, number] = trial
 
     drive()
@@ -486,11 +436,11 @@ def run_baseline(
 
 
 def _contradicted(
-    study: OfflineStudy, schedule: Schedule, sequence: str, odometry: str, run: Trial
+    study: OfflineStudy, schedule: Schedule, sequence: str, odometry: str, trial: Trial
 ) -> bool:
-    """Tell what scans say against a reference or a baseline; whether stretches are left out now."""
+    """Tell what scans say against a reference or a baseline; whether segments are left out now."""
     frames, sequences = schedule.frames(sequence), study.sequences
-    given = run.T_odom_sensor, run.mean_error, None, frames.T_ref_sensor
+    given = trial.T_odom_sensor, trial.mean_error, None, frames.T_ref_sensor
     for contradiction in (wrong := contradictions_of(sequences, sequence, *given)):
         _log.warning("sequences.%s, %s: %s", sequence, odometry, contradiction)
     if not wrong:
@@ -502,29 +452,29 @@ def _contradicted(
     return True
 
 
-def _checked(
+def checked(
     schedule: Schedule, workers: Pool[Any], labels: Sequence[str]
 ) -> Iterator[tuple[str, int, Trial]]:
     """Run a schedule; a baseline that had a fault, with which all is compared, drives once more."""
     again = set()
     for name, number, trial in schedule.run(workers):
         if number < len(labels):
-            if trial.faults and not trial.failure and (name, number) not in again:
+            if trial.reasons and not trial.failure and (name, number) not in again:
                 again.add((name, number))
                 what = "sequences.%s: %s has a fault with its own parameters, so once more: %s"
-                _log.warning(what, name, labels[number], trial.faults[-1])
+                _log.warning(what, name, labels[number], trial.reasons[-1])
                 schedule.add(name, number, trial.parameters)
                 continue
             check_baseline(labels[number], name, trial)
         yield name, number, trial
 
 
-def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
+def check_baseline(odometry: str, sequence: str, trial: Trial) -> None:
     """Refuse a baseline that failed, or had a fault, by a BaselineError."""
-    if not (run.failure or run.faults):
+    if not (trial.failure or trial.reasons):
         return
-    said = run.faults[-1] if run.faults else "it gave no pose, and no reason"
-    said = f"{run.failure}; {said}" if run.failure else said
+    said = trial.reasons[-1] if trial.reasons else "it gave no pose, and no reason"
+    said = f"{trial.failure}; {said}" if trial.failure else said
     raise BaselineError(
         f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: "
         f"{said}: mend the odometry (odometry in the study), or leave the sequence out, and run "

@@ -22,9 +22,9 @@ from adaptune.report.charts import (
 )
 from adaptune.space import Categorical, Parameter
 from adaptune.space import label as parameter_label
+from offline.bank_choice import figures
 from offline.config import OfflineStudy
 from offline.trial_table import FEW, TrialTable, importances, read_trials
-from offline.tuning import figures
 
 MOST_PANELS = 12
 """Panels of a chart; further sequences are not shown."""
@@ -84,7 +84,7 @@ def iteration_chart(table: TrialTable) -> Chart | None:
     number, errors = table.numbers, table.values
     if len(number) < 2:
         return None
-    allowed = np.where([trial.usable for trial in table.trials], errors, np.inf)
+    allowed = np.where([not trial.failure for trial in table.trials.values()], errors, np.inf)
     least = np.minimum.accumulate(allowed)
     drawn: list[Drawn] = [
         Points(number, errors, "trial", texts=[f"trial {n}" for n in number]),
@@ -104,10 +104,11 @@ def iteration_chart(table: TrialTable) -> Chart | None:
 
 def front_chart(table: TrialTable) -> Chart | None:
     """Error over CPU time of what may be chosen, and the front: less error only at more cost."""
-    table = table.some(t.usable and t.cost > 0.0 and 0.0 < t.value < np.inf for t in table.trials)
+    every = table.trials.values()
+    table = table.some(not t.failure and t.cost > 0.0 and 0.0 < t.value < np.inf for t in every)
     if len(table) < 2:
         return None
-    costs, errors = np.array([(trial.cost, trial.value) for trial in table.trials]).T
+    costs, errors = np.array([(trial.cost, trial.value) for trial in table.trials.values()]).T
     order = np.lexsort((errors, costs))
     least = np.minimum.accumulate(errors[order])
     front = order[np.diff(least, prepend=np.inf) < 0.0]
@@ -131,7 +132,7 @@ def front_chart(table: TrialTable) -> Chart | None:
         (Panel(x, y, tuple(drawn), height=1.3),),
         "Nothing that was tried has both less error and less cost than what lies on the front. "
         "Where the front is flat, more CPU time buys nothing. Errors are those of `trials.csv`, of "
-        "stretches; `front.csv` has those of whole drives, which only the best sets drive.",
+        "segments; `front.csv` has those of whole drives, which only the best sets drive.",
     )
 
 
@@ -172,11 +173,11 @@ def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | 
     )
 
 
-_FACTS = ("recording", "stretch", "fixed [%]")
+_FACTS = ("recording", "segment", "fixed [%]")
 
 
-def stretch_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
-    """Ratio to the fixed set's error on every stretch left out, sorted: a panel for each mode."""
+def segment_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
+    """Ratio to the fixed set's error on every segment left out, sorted: a panel for each mode."""
     recordings = [str(row["recording"]) for row in rows]
     panels = []
     for mode in (key for key in (rows[0] if rows else {}) if key not in _FACTS):
@@ -184,21 +185,21 @@ def stretch_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
         # One that is the fixed set everywhere says nothing.
         if not np.isfinite(ratios).all() or (np.abs(ratios - 1.0) < 1e-9).all():
             continue
-        panels.append(_stretch_panel(mode, ratios, recordings))
+        panels.append(_segment_panel(mode, ratios, recordings))
     if not panels:
         return None
     return Chart(
-        "stretches",
-        "Ratio to the fixed set's error on every stretch left out",
+        "segments",
+        "Ratio to the fixed set's error on every segment left out",
         tuple(panels),
-        "Each point is a stretch that nothing was trained on, sorted by its ratio; below 1 the "
+        "Each point is a segment that nothing was trained on, sorted by its ratio; below 1 the "
         "mode beats the fixed set. The band is the 95 % interval of the geometric mean over all "
-        "stretches. The oracle knows the errors in advance: the best set of each sequence.",
+        "segments. The oracle knows the errors in advance: the best set of each sequence.",
         columns=min(2, len(panels)),
     )
 
 
-def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence[str]) -> Panel:
+def _segment_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence[str]) -> Panel:
     rank = 1 + np.argsort(np.argsort(ratios, kind="stable"))
     of = figures(np.log(ratios), recordings)
     ends = np.array([0.5, len(ratios) + 0.5])
@@ -209,9 +210,9 @@ def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence
         Line(ends, [of.geometric] * 2, "geometric mean", dashed=True),
         Line(ends, [1.0, 1.0], "fixed", faint=True),
     ]
-    drawn.append(Points(rank, ratios, "stretch", texts=recordings))
+    drawn.append(Points(rank, ratios, "segment", texts=recordings))
     title = f"{mode}: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
-    x = Axis("stretch, by rising ratio [-]", limits=(0.5, float(ends[1])))
+    x = Axis("segment, by rising ratio [-]", limits=(0.5, float(ends[1])))
     return Panel(x, Axis("error over the fixed set's [-]", log=True), tuple(drawn), title)
 
 
@@ -242,11 +243,11 @@ def charts_of_validation(folder: Path) -> Charts:
 
     An AdaptuneError says that its file is not as `adaptune validate` wrote it.
     """
-    path = folder / "stretches.json"
+    path = folder / "segments.json"
     if not path.exists():
         yield "No validation: run `adaptune validate`."
         return
     try:
-        yield stretch_chart(json.loads(path.read_text("utf-8")))
+        yield segment_chart(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise AdaptuneError(f"{path}: is damaged ({error!r}); run `adaptune validate`") from error

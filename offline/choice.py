@@ -39,7 +39,7 @@ FINALISTS = 4
 OTHERS = 2
 """Sets at no more than the baseline's cost, and at any, that do so, too."""
 LOST = 0.5
-"""Share of the capped error, as the mean of a block, above which track counts as lost there."""
+"""Share of the clipped error, as the mean of a block, above which track counts as lost there."""
 
 
 class NothingUsableError(AdaptuneError):
@@ -52,7 +52,7 @@ class BlockErrors(NamedTuple):
     """What is known of some sets: errors in blocks, costs, and restarts by the health check."""
 
     trials: Sequence[int]  # their numbers; a baseline is among them
-    # (n_blocks, n_trials): mean capped error in percent, or another objective over a recording
+    # (n_blocks, n_trials): mean clipped error in percent, or another objective over a recording
     errors: NDArray[np.float64]
     sequence: NDArray[np.intp]  # (n_blocks,): number of each block's recording
     costs: NDArray[np.float64]  # (n_trials,): ms of CPU time a scan; NaN if unknown

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from adaptune._system.strict import ConfigurationError, Plugins, StrictModel, validated
 from adaptune.errors import AdaptuneError, Finding, nearest
 from adaptune.odometry.registry import PROGRAMS
 from adaptune.space import (
@@ -22,7 +23,6 @@ from adaptune.space import (
     Value,
     describe,
 )
-from adaptune.strict import ConfigurationError, Plugins, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.portfolios import portfolio_sets
 from adaptune.study.study import CONFIGURATION, Study
@@ -382,9 +382,9 @@ class OfflineConfig(StrictModel):
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
     objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
-    # Stretches of all training sequences together that are driven by every set, four of each at
+    # Segments of all training sequences together that are driven by every set, four of each at
     # least; where sequences are short, all of them are driven.
-    stretches: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 12
+    segments: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 12
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     # Portfolios that the search begins with, and the digest of each.
@@ -424,7 +424,7 @@ class OfflineConfig(StrictModel):
 
 _SEARCH = (
     *("sampler", "sampler_settings", "initial", "batch", "seed"),
-    *("objective", "stretches", "repeats", "baseline_runs", "portfolio"),
+    *("objective", "segments", "repeats", "baseline_runs", "portfolio"),
 )
 """Settings by which a search differs from another."""
 
@@ -435,12 +435,12 @@ class OfflineStudyConfig(StudyConfig):
     offline: OfflineConfig = OfflineConfig()
 
     @property
-    def stretches(self) -> int | None:
-        """Stretches of each training sequence that are driven; None for the whole of it.
+    def segments(self) -> int | None:
+        """Segments of each training sequence that are driven; None for the whole of it.
 
         A program costs too much to start anew, and some metrics judge whole trajectories.
         """
-        n, whole = self.offline.stretches, {"kitti", "ape"} & set(self.offline.objective)
+        n, whole = self.offline.segments, {"kitti", "ape"} & set(self.offline.objective)
         if n == "all" or whole or any(one.name in PROGRAMS for one in self.odometries.values()):
             return None
         return max(4, math.ceil(n / len(self.training)))
@@ -462,7 +462,7 @@ class OfflineStudyConfig(StudyConfig):
     def resolved(self) -> dict[str, Any]:
         """See `StudyConfig.resolved`."""
         resolved, offline = super().resolved(), self.offline
-        resolved["offline"]["stretches"] = self.stretches or "all"
+        resolved["offline"]["segments"] = self.segments or "all"
         if settings := SETTINGS.get(offline.sampler):
             given = settings.model_validate(offline.sampler_settings)
             whole = given.model_dump(mode="json", exclude_none=True)

@@ -1,20 +1,20 @@
 """What CPU time buys: the front of error over cost, and what it costs on the machine at hand."""
 
 import json
-import time
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from itertools import islice
 from typing import Any
 
 import numpy as np
 
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import AdaptuneError
-from adaptune.machine import resident_megabytes
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE
-from adaptune.odometry.tracker import Tracker
-from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
+from adaptune.runs.loop import replay
+from adaptune.runs.record import Run
 from adaptune.space import ODOMETRY, in_words
 from adaptune.study.driven import ANY, BELOW, COST, EQUAL, ERROR, FILES, OWN, WITHIN
 from offline.choice import (
@@ -133,7 +133,7 @@ def left_out(
     return ""
 
 
-SECONDS = 60.0
+TIMED_SECONDS = 60.0
 """Of a recording, on which costs are measured."""
 
 
@@ -159,24 +159,19 @@ def measured_front(
     if len(stamps) < 2:
         raise AdaptuneError(f"{scans.name}: holds {len(stamps)} scans; two are the least")
     period = 1e-6 * float(np.diff(stamps)[0])
-    n = max(2, min(round(1e3 * SECONDS / period), scans.n_messages))
+    n = max(2, min(round(1e3 * TIMED_SECONDS / period), scans.n_messages))
     for i, row in enumerate(rows):
-        odometry = study.odometry(sets[row["trial"]], scans.name)
-        tracker, took, prepared = Tracker(odometry, study.config.health), [], 0.0
-        try:
-            for j, scan in enumerate(islice(scans, n)):
-                begin, cpu = time.perf_counter(), time.process_time()
-                ready = odometry.prepare(scan)
-                prepared += time.process_time() - cpu
-                tracker.register_prepared(scan.stamp, ready, scan=scan)
-                took.append(time.perf_counter() - begin)
-                progress("driving the front", i * n + j + 1, n * len(rows))
-            used = odometry.usage
-        finally:
-            odometry.close()
-        row[COST] = 1e3 * (prepared + used.cpu) / len(took)
+
+        def watch(run: Run, before: int = i * n) -> None:
+            progress("driving the front", before + run.done, n * len(rows))
+
+        with closing(study.odometry(sets[row["trial"]], scans.name)) as odometry:
+            run = replay(islice(scans, n), odometry, study.config.health, watch=watch)
+            memory = odometry.usage.memory
+        took = [step.prepare_seconds + step.register_seconds for step in run.steps]
+        row[COST] = run.cpu_ms
         row["99 % [ms]"] = 1e3 * float(np.percentile(took, 99.0))
-        row["memory [MB]"] = used.memory or resident_megabytes()
+        row["memory [MB]"] = memory or run.memory
     best = recommended(rows, study.config.online.milliseconds(own_cost(rows)), period)
     return [row | {"recommended": row is best} for row in sorted(rows, key=lambda row: row[COST])]
 

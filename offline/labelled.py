@@ -4,25 +4,22 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
-from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Summary, Trial, summarise
+from adaptune._system.machine import shared_cores
 from adaptune.bank.members import LEVER, RESTART, Agreement, share
 from adaptune.bank.rest import Backoff
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING, USUAL_SHARE
-from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
-from adaptune.machine import shared_cores
+from adaptune.live.hops import HopErrors, Hops, HopSquares, hop_squares
 from adaptune.metrics import (
     LOST_ABOVE,
     cap,
     span,
     sub_trajectory_rte,
-    sub_trajectory_turns,
     sub_trajectory_vectors,
     travelled,
     window_ends,
@@ -40,10 +37,10 @@ from adaptune.model.rules import (
 from adaptune.odometry.factory import Factory
 from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.paired import MIN_RECORDINGS
-from adaptune.recording.scan import stretch_numbers
+from adaptune.recording.scan import segment_numbers
+from adaptune.runs.archive import PREPARE_MS, REGISTER_MS, Archive, Trial, TrialSummary
 from adaptune.space import ParameterSets
-from adaptune.study.driven import PER_STRETCH
-from offline.campaign import read_whole_drives
+from adaptune.study.driven import PER_SEGMENT
 from offline.choice import (
     MOST_OF_PERIOD,
     PER_BLOCK,
@@ -55,7 +52,7 @@ from offline.choice import (
     finalists,
     front,
 )
-from offline.config import OfflineConfig, OfflineStudy
+from offline.config import OfflineStudy
 from offline.objective import weighted
 
 if TYPE_CHECKING:
@@ -100,7 +97,7 @@ class BankSimulation:
     motions: Callable[[tuple[int, ...]], Poses]
     ends_of_whole: NDArray[np.intp] | None = None  # `ends`, where it is a part of a simulation
     health: HealthCheck = field(default_factory=HealthCheck)  # of the bank as a whole
-    _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
+    _kept: dict[tuple[int, ...], list[HopSquares | None]] = field(default_factory=dict, init=False)
 
     @cached_property
     def ends(self) -> NDArray[np.intp]:
@@ -109,10 +106,10 @@ class BankSimulation:
             return self.ends_of_whole
         return window_ends(self.T_ref_counted, self.length)
 
-    def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
+    def squares(self, members: tuple[int, ...]) -> list[HopSquares | None]:
         """What is measured of members before the first frame of each period."""
-        if members in self._live:
-            return self._live[members]
+        if members in self._kept:
+            return self._kept[members]
         start, end, T_start_end, projection = self.hops
         T_previous_current = self.motions(members)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
@@ -125,15 +122,15 @@ class BankSimulation:
         unknown = np.concatenate([np.zeros((1, len(members)), np.intp), np.cumsum(~known, axis=0)])
         errors[unknown[end] > unknown[start]] = np.nan
         hops = HopErrors(errors, metres[start], metres[end], seconds[end])
-        self._live[members] = [
-            live_squares(
+        self._kept[members] = [
+            hop_squares(
                 HopErrors(*(array[end < frame] for array in hops)).recent(
                     float(metres[frame]), float(seconds[frame])
                 )
             )
             for frame in periods(self.period)[0]
         ]
-        return self._live[members]
+        return self._kept[members]
 
     def agreeing(self, members: tuple[int, ...], votes: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
@@ -197,7 +194,7 @@ class BankSimulation:
         weights: NDArray[np.float64],
         agreeing: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float64]:
-        """Capped errors of a bank at every frame, NaN without a sub-trajectory.
+        """Clipped errors of a bank at every frame, NaN without a sub-trajectory.
 
         Weights are of shape (n_periods, n_members). Who agrees is found with the same weights when
         left out, see `agreeing`.
@@ -233,14 +230,14 @@ def recorded_motions(trials: Sequence[Trial]) -> Poses:
 
 
 MARGIN_FRAMES = 2
-"""Frames that a part of a simulation is longer than its stretch: a distance that is summed from
+"""Frames that a part of a simulation is longer than its segment: a distance that is summed from
 another frame may differ in its last bits, and a sub-trajectory then ends one frame later."""
 
 
-def stretches(
-    simulation: BankSimulation, known: NDArray[np.intp], n: float = PER_STRETCH
+def segments(
+    simulation: BankSimulation, known: NDArray[np.intp], n: float = PER_SEGMENT
 ) -> NDArray[np.intp]:
-    """Number of each labelled frame's stretch along the reference, of shape (n,).
+    """Number of each labelled frame's segment along the reference, of shape (n,).
 
     `known` has the numbers of these frames. What is driven without interruption is cut into pieces
     of `n` sub-trajectories; the last one joins the one before if it is shorter than half of that.
@@ -260,7 +257,7 @@ def stretches(
 
 
 def block_means(errors: NDArray[np.floating], block: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Mean capped errors of shape (n_blocks, n_sets) from those at frames, by their blocks."""
+    """Mean clipped errors of shape (n_blocks, n_sets) from those at frames, by their blocks."""
     _, first = np.unique(block, return_index=True)
     sums = np.add.reduceat(cap(errors), first)
     return np.asarray(sums / np.diff([*first, len(errors)])[:, None])
@@ -274,7 +271,7 @@ class LabelledSequence:
     recording: str  # that it is, or is a part of
     simulation: BankSimulation  # of all frames
     known: NDArray[np.intp]  # (n,): numbers of the labelled ones
-    stretch: NDArray[np.intp]  # (n,): number of each frame's stretch
+    segment: NDArray[np.intp]  # (n,): number of each frame's segment
     # (n, n_sets): percent, infinite where the track was lost, NaN where a set never gave a pose.
     errors: NDArray[np.float32]
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
@@ -344,7 +341,7 @@ class LabelledSequence:
         return replace(
             self,
             known=known,
-            stretch=self.stretch[kept],
+            segment=self.segment[kept],
             errors=self.errors[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
             block=self.block[kept],
@@ -353,7 +350,7 @@ class LabelledSequence:
         )
 
     def in_blocks(self) -> NDArray[np.float64]:
-        """Mean capped errors, of shape (n_blocks, n_sets), or the objective, (1, n_sets)."""
+        """Mean clipped errors, of shape (n_blocks, n_sets), or the objective, (1, n_sets)."""
         if self.values is not None:
             return self.values[None]
         return block_means(self.errors, self.block)
@@ -412,7 +409,7 @@ class LabelledData(NamedTuple):
         if not self.costs.usable(BASELINE):
             raise NothingUsableError(
                 "the baseline fails where it begins within a recording, though not along a whole "
-                "one; set offline.stretches: all"
+                "one; set offline.segments: all"
             )
         return self.subset([n for n in self.sets if self.costs.usable(n)])
 
@@ -424,9 +421,9 @@ class LabelledData(NamedTuple):
     def folds(
         self, by_recording: bool | None = None
     ) -> list[tuple[LabelledSequence, "LabelledData"]]:
-        """Leave each recording out, or, by default below `MIN_RECORDINGS`, each stretch.
+        """Leave each recording out, or, by default below `MIN_RECORDINGS`, each segment.
 
-        A stretch is not left out if nothing far enough from it remains.
+        A segment is not left out if nothing far enough from it remains.
         """
         if by_recording is None:
             by_recording = len(self.recordings) >= MIN_RECORDINGS
@@ -435,8 +432,8 @@ class LabelledData(NamedTuple):
             if by_recording:
                 folds.append((whole, self.without(whole)))
                 continue
-            for number in np.unique(whole.stretch):
-                left = whole.frames(whole.stretch == number)
+            for number in np.unique(whole.segment):
+                left = whole.frames(whole.segment == number)
                 known = [
                     s if s.recording != whole.recording else s.frames(~s.near(left))
                     for s in self.sequences
@@ -450,10 +447,10 @@ class LabelledData(NamedTuple):
         others = [s for s in self.sequences if s.recording != sequence.recording]
         return self._replace(sequences=others)
 
-    def stretches(self) -> NDArray[np.intp]:
-        """Number of every frame's stretch, of shape (n_frames,)."""
-        cuts = np.concatenate([s.stretch for s in self.sequences])
-        return stretch_numbers(self.numbers(), cuts)
+    def segments(self) -> NDArray[np.intp]:
+        """Number of every frame's segment, of shape (n_frames,)."""
+        cuts = np.concatenate([s.segment for s in self.sequences])
+        return segment_numbers(self.numbers(), cuts)
 
     def numbers(self) -> NDArray[np.intp]:
         """Number of every frame's sequence, of shape (n_frames,)."""
@@ -471,7 +468,11 @@ class LabelledData(NamedTuple):
         self, sequences: Sequence[LabelledSequence], trials: Sequence[int], costs: Costs
     ) -> BlockErrors:
         none, errors = np.zeros(len(trials)), [s.in_blocks() for s in sequences]
-        turns = [block_means(s.turns, s.block) for s in sequences if s.turns is not None]
+        turns = [
+            block_means(s.turns, s.block)
+            for s in sequences
+            if s.turns is not None and s.values is None  # an objective has a value a recording
+        ]
         return BlockErrors(
             trials,
             np.concatenate(errors),
@@ -523,7 +524,7 @@ class LabelledData(NamedTuple):
         pca = ScaledPCA(self.sequences[0].blocks.values())
         data = TrainingData(
             pca.fit(descriptors).transform(descriptors),
-            self.stretches(),
+            self.segments(),
             self.errors(),
             self.sets,
             fixed := self.fixed(),
@@ -535,7 +536,7 @@ class LabelledData(NamedTuple):
     def member_pool(self, fixed: int) -> list[int]:
         """Trials that the members of a bank are chosen from, the fixed set's first."""
         known = set.intersection(*(set(s.vectors) for s in self.sequences))
-        best = best_sets(self.errors(), self.stretches(), self.sets)[:MEMBER_POOL_SIZE]
+        best = best_sets(self.errors(), self.segments(), self.sets)[:MEMBER_POOL_SIZE]
         return [fixed, *(trial for trial in best if trial != fixed and trial in known)]
 
     def can_pay(self, members: Iterable[int]) -> bool:
@@ -562,13 +563,13 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
     return first, number
 
 
-def mean_cost(runs: Sequence[Summary], preparation: int) -> SetCost:
+def mean_cost(trials: Sequence[TrialSummary], preparation: int) -> SetCost:
     """Mean cost of a set over the sequences that it was run on; infinite if it failed."""
     register, prepare = (
-        float(np.mean([run.others.get(key, np.nan) for run in runs]))
+        float(np.mean([trial.others.get(key, np.nan) for trial in trials]))
         for key in (REGISTER_MS, PREPARE_MS)
     )
-    failed = any(run.failure for run in runs)
+    failed = any(trial.failure for trial in trials)
     return SetCost(np.inf if failed else register, prepare, preparation)
 
 
@@ -584,9 +585,9 @@ def measured_costs(
     costs: dict[int, SetCost] = {}
     known = defaultdict[int, list[float]](list)  # what each preparation took in trials that worked
     for trial in sets:
-        runs = [archive.finished(name)[trial] for name in names]
+        trials = [archive.finished(name)[trial] for name in names]
         number = numbers.setdefault(odometry(sets[trial]).preparation, len(numbers))
-        costs[trial] = cost = mean_cost(runs, number)
+        costs[trial] = cost = mean_cost(trials, number)
         if np.isfinite(cost.alone):
             known[number].append(cost.prepare)
     usual = {number: float(np.median(times)) for number, times in known.items()}
@@ -613,68 +614,6 @@ def labelled_data(study: OfflineStudy, archive: Archive, sets: ParameterSets) ->
     blocks = data.blocks()
     own = float(blocks.costs[blocks.baseline])
     return data._replace(budget=study.config.online.milliseconds(own))
-
-
-def with_whole_drives(
-    data: LabelledData,
-    archive: Archive,
-    config: OfflineConfig,
-    bare: Mapping[str, Collection[int]] = MappingProxyType({}),
-) -> LabelledData:
-    """The same with finalists' drives of whole recordings; of those in `bare`, the bare ones.
-
-    What finalists cost over the baseline is what they cost side by side in these drives.
-    """
-    asked = [*data.finalists(), *data.sets.defaults]
-    drives = read_whole_drives(archive, [s.name for s in data.sequences], asked)
-    if not (known := sorted(set.intersection(*map(set, drives.values())))):
-        return data
-    sequences = []
-    for s in data.sequences:
-        without = bare.get(s.name, ())
-        trials = [archive.read(s.name, n, whole=True, bare=n in without) for n in known]
-        sequences.append(replace(s, whole=_whole(s, trials, config)))
-    if not all(archive.is_uncut(s.name) for s in sequences):
-        runs = {n: [of[n] for of in drives.values()] for n in known}
-        data = data._replace(beside=side_by_side(data.costs, runs))
-    return data._replace(sequences=sequences, driven=known)
-
-
-def side_by_side(costs: Costs, runs: Mapping[int, Sequence[Summary]]) -> Costs:
-    """The same, where some sets cost as much more than the baseline as in these runs beside it.
-
-    In the trials, the machine may have been busier with one set than with another.
-    """
-    beside = {n: mean_cost(of, costs.sets[n].preparation) for n, of in runs.items()}
-    own = beside[BASELINE].alone if BASELINE in beside else np.nan
-    scale = costs.alone(BASELINE) / own if own > 0.0 else np.nan
-    found = {
-        n: SetCost(scale * c.register, scale * c.prepare, c.preparation) for n, c in beside.items()
-    }
-    known = {n: cost for n, cost in found.items() if np.isfinite(cost.alone) and scale > 0.0}
-    return replace(costs, sets={**costs.sets, **known})
-
-
-def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) -> LabelledSequence:
-    T_ref_sensor, length = s.simulation.T_ref_sensor, s.simulation.length
-    everywhere = replace(s.simulation, T_ref_counted=T_ref_sensor)
-    errors = np.stack([trial.errors for trial in trials], axis=1).astype(np.float32)
-    turns = [sub_trajectory_turns(T_ref_sensor, trial.T_odom_sensor, length) for trial in trials]
-    frames = np.flatnonzero(~np.isnan(errors).any(axis=1))
-    block, drives = stretches(everywhere, frames, PER_BLOCK), [summarise(trial) for trial in trials]
-    values = [weighted(config.objective, drive.metrics) for drive in drives]
-    return replace(
-        s,
-        simulation=everywhere,
-        known=frames,
-        stretch=block,
-        errors=errors[frames],
-        vectors={},
-        block=block,
-        values=None if s.values is None else np.array(values),
-        restarts=np.array([np.inf if drive.failure else drive.restarts for drive in drives]),
-        turns=np.stack(turns, axis=1)[frames],
-    )
 
 
 def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
@@ -730,10 +669,10 @@ def _labelled(
         study.sequences.recorded_in(name),
         simulation,
         known,
-        stretches(simulation, known),
+        segments(simulation, known),
         errors[known],
         frames.blocks,
-        block=stretches(simulation, known, PER_BLOCK),
+        block=segments(simulation, known, PER_BLOCK),
         values=None if set(objective) == {"rte"} else np.array(values),
         span=span(frames.counted, length),
         restarts=np.array(restarts),

@@ -2,13 +2,14 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from adaptune.archive import Summary
 from adaptune.geometry import Poses
 from adaptune.metrics import FAILURE, absolute_error, kitti_error, relative_error
+from adaptune.runs.archive import TrialSummary
 from adaptune.space import ODOMETRY, ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 
@@ -26,12 +27,14 @@ PENALTY = 10.0
 """A set that is not usable has so many times the baseline's value at least: samplers keep away."""
 
 
-class Verdict(NamedTuple):
+class JudgedSet(NamedTuple):
     """How a parameter set did on some sequences."""
 
     parameters: ParameterSet
     value: float  # mean of the objective over the sequences
     failure: str = ""  # why it is never chosen; empty if it may be
+    by_sequence: Mapping[str, float] = MappingProxyType({})  # the objective
+    cost: float = np.nan  # milliseconds of CPU time a scan, NaN if unknown
 
     @property
     def state(self) -> str:
@@ -55,10 +58,13 @@ def trajectory_metrics(T_ref_sensor: Poses, T_odom_sensor: Poses) -> dict[str, f
     return {name: float(np.fmin(value, LARGEST_METRIC)) for name, value in found.items()}
 
 
-def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
+def judge(config: OfflineConfig, trials: Mapping[str, TrialSummary]) -> JudgedSet:
     """Judge a parameter set by its trials on some sequences."""
-    value = float(np.mean([weighted(config.objective, run.metrics) for run in runs]))
-    return Verdict(runs[0].parameters, value, next((r.failure for r in runs if r.failure), ""))
+    every = list(trials.values())
+    by_sequence = {name: weighted(config.objective, one.metrics) for name, one in trials.items()}
+    value, cost = np.mean([*by_sequence.values()]), np.mean([trial.cost for trial in every])
+    failure = next((trial.failure for trial in every if trial.failure), "")
+    return JudgedSet(every[0].parameters, float(value), failure, by_sequence, float(cost))
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -66,10 +72,10 @@ def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> f
     return sum(weight * metrics.get(name, LARGEST_METRIC) for name, weight in weights.items())
 
 
-def sampler_results(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
+def sampler_results(judged: Sequence[JudgedSet]) -> list[tuple[ParameterSet, float]]:
     """Parameters and values of trials as samplers get them; the first one is the baseline's."""
-    worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
-    return [(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts]
+    worst = PENALTY * (judged[0].value or 1.0) if judged else 0.0
+    return [(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in judged]
 
 
 def label(weights: Mapping[Metric, float], units: bool = False) -> str:
@@ -80,26 +86,26 @@ def label(weights: Mapping[Metric, float], units: bool = False) -> str:
     )
 
 
-def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
+def failed_in_words(judged: Mapping[int, JudgedSet]) -> list[str]:
     """A sentence about the sets that are not usable, if there are any."""
-    failures = Counter(verdict.failure for verdict in verdicts.values() if verdict.failure)
+    failures = Counter(one.failure for one in judged.values() if one.failure)
     if not failures:
         return []
     (why, n), *others = failures.most_common()
     often = f" ({n} of them)" * bool(others)
     return [
-        f"{failures.total()} of {len(verdicts)} parameter sets failed and are never chosen: "
+        f"{failures.total()} of {len(judged)} parameter sets failed and are never chosen: "
         f"{why}{often}; `trials.csv` has all reasons."
     ]
 
 
-def unread_in_words(finished: Mapping[str, Mapping[int, Summary]]) -> list[str]:
+def unread_in_words(finished: Mapping[str, Mapping[int, TrialSummary]]) -> list[str]:
     """A sentence for each odometry whose sets all gave the same poses, by sequence and trial."""
     errors: dict[str, list[tuple[float, ...]]] = {}
-    for number, run in next(iter(finished.values())).items():
-        if not run.failure:
+    for number, trial in next(iter(finished.values())).items():
+        if not trial.failure:
             each = tuple(of[number].mean_error for of in finished.values())
-            errors.setdefault(str(run.parameters.get(ODOMETRY, "")), []).append(each)
+            errors.setdefault(str(trial.parameters.get(ODOMETRY, "")), []).append(each)
     return [
         f"All {len(every)} sets {f'of {label} ' * bool(label)}gave the same poses, to the last "
         f"digit: no parameter has an effect; look whether they reach the program."
@@ -109,14 +115,14 @@ def unread_in_words(finished: Mapping[str, Mapping[int, Summary]]) -> list[str]:
     ]
 
 
-def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
+def baseline_words(config: OfflineConfig, trials: Sequence[TrialSummary]) -> list[str]:
     """A sentence about the spread of the baseline over its runs, if it was run several times."""
     objective = config.objective
     # Times never repeat.
     weights = {name: weight for name, weight in objective.items() if name not in TIMED}
-    if not all(run.repeats for run in runs) or not weights:
+    if not all(trial.repeats for trial in trials) or not weights:
         return []
-    values = np.mean([[weighted(weights, m) for m in run.repeats] for run in runs], axis=0)
+    values = np.mean([[weighted(weights, m) for m in trial.repeats] for trial in trials], axis=0)
     return [
         f"The baseline ran {len(values)} times: {label(objective, units=True)} {values.mean():.4g} "
         f"in the mean, {values.min():.4g} to {values.max():.4g}, "

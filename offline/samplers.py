@@ -82,7 +82,7 @@ def another(
     return None
 
 
-KEPT = 0.5
+BASELINE_CHANCE = 0.5
 """Chance of a value to be the baseline's."""
 
 
@@ -291,7 +291,7 @@ class AskedSampler(Sampler):
         if number % 2 or self.config.sampler != "tpe":
             return found
         rng, base = np.random.default_rng((self.config.seed, number, 2)), self.space.baseline
-        kept = zip(found.parameters.items(), rng.random(len(base)) < KEPT, strict=True)
+        kept = zip(found.parameters.items(), rng.random(len(base)) < BASELINE_CHANCE, strict=True)
         return found._replace(parameters={k: base[k] if keep else v for (k, v), keep in kept})
 
     def _call(self, method: Callable[..., Any], *given: Any) -> Any:

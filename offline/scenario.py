@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive
+from adaptune._system.files import replacing, write_text
 from adaptune.errors import AdaptuneError
-from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel, Rule, TrainingData
-from adaptune.model.registry import asked, selected
+from adaptune.model.registry import call_user_code, selected
 from adaptune.model.rules import Costs, FixedSet, SetCost
-from adaptune.paired import MIN_BLOCKS, MIN_RECORDINGS, of_stretches
+from adaptune.paired import MIN_BLOCKS, MIN_RECORDINGS, of_segments
 from adaptune.report.tables import csv_text
+from adaptune.runs.archive import Archive
 from adaptune.space import ParameterSets, load_space
+from offline.bank_choice import log_ratios
 from offline.choice import BlockErrors, choose
 from offline.config import OfflineStudy
 from offline.labelled import block_means, labelled_data
-from offline.tuning import log_ratios
 
 
 class Scenario(NamedTuple):
@@ -34,8 +34,8 @@ class Scenario(NamedTuple):
     sequence: NDArray[np.str_]  # (n,)
     frame: NDArray[np.intp]  # (n,): number in the sequence
     end: NDArray[np.intp]  # (n,): last frame of its sub-trajectory
-    stretch: NDArray[np.intp]  # (n,): number of its stretch
-    fold: NDArray[np.intp]  # (n,): of a recording or, with few of them, of a stretch
+    segment: NDArray[np.intp]  # (n,): number of its segment
+    fold: NDArray[np.intp]  # (n,): of a recording or, with few of them, of a segment
     time: NDArray[np.float64]  # (n,): seconds from the sequence's first scan
     place: NDArray[np.float64]  # (n, 3): metres, by the reference
     features: NDArray[np.float32]  # (n, n_features): averaged descriptors
@@ -57,11 +57,11 @@ class Scenario(NamedTuple):
         return {name: getattr(self, name) for name in _OF_FRAMES} | where | features | errors
 
     def fixed(self, frames: NDArray[np.bool_]) -> int:
-        """Trial number of the fixed set by some frames, with their stretches as blocks."""
-        stretch = self.stretch[frames]
-        _, first = np.unique(stretch, return_index=True)
+        """Trial number of the fixed set by some frames, with their segments as blocks."""
+        segment = self.segment[frames]
+        _, first = np.unique(segment, return_index=True)
         _, sequence = np.unique(self.sequence[frames][first], return_inverse=True)
-        errors, restarts = block_means(self.performances[frames], stretch), np.zeros(len(self.sets))
+        errors, restarts = block_means(self.performances[frames], segment), np.zeros(len(self.sets))
         return choose(BlockErrors(self.sets.trials, errors, sequence, self.cost, restarts))
 
     def score(self, *rules: Rule) -> list[dict[str, Any]]:
@@ -70,20 +70,20 @@ class Scenario(NamedTuple):
         Columns are the mean error in percent, the ratio to the fixed set's with its 95 % interval,
         and the cost. The last two are known in hindsight only. See `select`.
         """
-        capped, column = cap(self.performances), list(self.sets.trials).index
+        clipped, column = cap(self.performances), list(self.sets.trials).index
         some = [column(trial) for trial in self.candidates]
-        single = some[int(np.argmin(capped[:, some].mean(axis=0)))]
+        single = some[int(np.argmin(clipped[:, some].mean(axis=0)))]
         chosen = {type(rule).__name__: self.select(rule) for rule in rules}
         chosen |= {"fixed": self.select(FixedSet())}
-        chosen |= {"best single set": np.full(len(capped), single)}
-        chosen["oracle"] = np.array(some)[np.argmin(capped[:, some], axis=1)]
-        frames, rows = np.arange(len(capped)), []
-        of = capped[frames, chosen["fixed"]]
-        _, first = np.unique(self.stretch, return_index=True)
+        chosen |= {"best single set": np.full(len(clipped), single)}
+        chosen["oracle"] = np.array(some)[np.argmin(clipped[:, some], axis=1)]
+        frames, rows = np.arange(len(clipped)), []
+        of = clipped[frames, chosen["fixed"]]
+        _, first = np.unique(self.segment, return_index=True)
         for name, columns in chosen.items():
-            errors, cost = capped[frames, columns], float(self.cost[columns].mean())
-            logs = log_ratios(errors, of, self.stretch)
-            value, ends, _ = of_stretches(logs, self.sequence[first].tolist())
+            errors, cost = clipped[frames, columns], float(self.cost[columns].mean())
+            logs = log_ratios(errors, of, self.segment)
+            value, ends, _ = of_segments(logs, self.sequence[first].tolist())
             low, high = ends if ends and len(logs) >= MIN_BLOCKS else (None, None)
             row = {"rule": name, "RTE [%]": float(errors.mean()), "vs fixed": value}
             rows.append(row | {"low": low, "high": high, "cost [ms]": cost})
@@ -113,10 +113,10 @@ class Scenario(NamedTuple):
                 raise AdaptuneError(f"nothing is left to learn from without fold {fold}")
             pca = ScaledPCA(self.blocks.values())
             features = pca.fit(self.features[rest]).transform(self.features)
-            of_rest = features[rest], self.stretch[rest], self.performances[rest]
+            of_rest = features[rest], self.segment[rest], self.performances[rest]
             fixed, costs = self.fixed(rest), Costs(each, 0.0)
             some = tuple(dict.fromkeys((fixed, *self.candidates)))
-            asked(rule.fit, TrainingData(*of_rest, self.sets, fixed, some, costs=costs))
+            call_user_code(rule.fit, TrainingData(*of_rest, self.sets, fixed, some, costs=costs))
             for i in np.flatnonzero(left_out):
                 selection = selected(rule, self.sets, features[i])
                 if selection.weights is not None:
@@ -140,7 +140,7 @@ class Scenario(NamedTuple):
         return found
 
 
-_OF_FRAMES = ("sequence", "frame", "end", "stretch", "fold")
+_OF_FRAMES = ("sequence", "frame", "end", "segment", "fold")
 
 
 def scenario(study: OfflineStudy) -> Scenario:
@@ -160,12 +160,12 @@ def scenario(study: OfflineStudy) -> Scenario:
     data = labelled_data(study, archive, sets)
     recordings = np.concatenate([np.full(len(s.known), s.recording) for s in data.sequences])
     several = len(data.recordings) >= MIN_RECORDINGS
-    fold = np.unique(recordings, return_inverse=True)[1] if several else data.stretches()
+    fold = np.unique(recordings, return_inverse=True)[1] if several else data.segments()
     return Scenario(
         np.concatenate([np.full(len(s.known), s.name) for s in data.sequences]),
         np.concatenate([s.known for s in data.sequences]),
         np.concatenate([s.ends for s in data.sequences]),
-        data.stretches(),
+        data.segments(),
         fold,
         np.concatenate([s.seconds for s in data.sequences]),
         np.concatenate([s.positions for s in data.sequences]),
@@ -222,12 +222,12 @@ def read_scenario(path: Path | str) -> Scenario:
             np.stack([columns[f"{kind}_{i}"] for i in which], axis=1)
             for kind, which in (("feature", numbers), ("rte", trials))
         )
-        frame, end, stretch, fold = (columns[name].astype(np.intp) for name in _OF_FRAMES[1:])
+        frame, end, segment, fold = (columns[name].astype(np.intp) for name in _OF_FRAMES[1:])
         return Scenario(
             columns["sequence"].astype(str),
             frame,
             end,
-            stretch,
+            segment,
             fold,
             columns["time"].astype(float),
             np.stack([columns[axis].astype(float) for axis in "xyz"], axis=1),

@@ -9,11 +9,11 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adaptune.archive import Summary
-from adaptune.files import write_text
+from adaptune._system.files import write_text
+from adaptune.runs.archive import TrialSummary
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
-from offline.objective import Verdict, judge, sampler_results
+from offline.objective import JudgedSet, judge, sampler_results
 
 if TYPE_CHECKING:
     from offline.samplers import Sampler
@@ -40,9 +40,8 @@ class Stopwatch:
 
     @cached_property
     def _before(self) -> float:
-        with suppress(OSError, ValueError, TypeError, AttributeError):
-            read = json.loads(self._path.read_text(encoding="utf-8"))
-            return sum(map(float, read.values()))
+        with suppress(OSError, ValueError, TypeError, KeyError):
+            return float(json.loads(self._path.read_text(encoding="utf-8"))["seconds"])
         return 0.0
 
     @property
@@ -56,7 +55,7 @@ class Stopwatch:
         write_text(self._path, json.dumps({"seconds": seconds}) + "\n")
 
 
-Finished = Mapping[str, Mapping[int, Summary]]
+Finished = Mapping[str, Mapping[int, TrialSummary]]
 """By sequence, the finished trials by their numbers."""
 
 
@@ -74,12 +73,12 @@ class Search:
         config: OfflineConfig,
         space: ParameterSpace,
         finished: Finished,
-        known: Mapping[int, Summary],
+        known: Mapping[int, TrialSummary],
         first: Sequence[ParameterSet] = (),
     ):
         self.sets: dict[int, ParameterSet] = {}  # by number, in the order in which they began
         self.sources: dict[int, str] = {}  # what proposed each, see `Proposal`
-        self.done: dict[int, Verdict] = {}  # by number, those that are finished everywhere
+        self.done: dict[int, JudgedSet] = {}  # by number, those that are finished everywhere
         self.end: str | None = None  # why no more trials begin
         self._config, self._space, self._limit = config, space, config.most_trials
         self._finished, self._known, self._first = finished, dict(known), first
@@ -108,8 +107,8 @@ class Search:
         """
         for number in [n for n in self.sets if n not in self.done]:
             if all(number in of for of in self._finished.values()):
-                runs = [of[number] for of in self._finished.values()]
-                self.done[number] = judge(self._config, runs)
+                trials = {name: of[number] for name, of in self._finished.items()}
+                self.done[number] = judge(self._config, trials)
         order = list(self.sets)
         seen = order[: max(0, len(order) - self._config.batch + 1)]
         if self.end is not None or any(n not in self.done for n in seen):
@@ -117,7 +116,7 @@ class Search:
         self.end = self._spent([self.done[n] for n in seen])
         return None if self.end else self._next(order, seen, hours)
 
-    def _spent(self, seen: Sequence[Verdict]) -> str | None:
+    def _spent(self, seen: Sequence[JudgedSet]) -> str | None:
         """The budget that is used up, in words."""
         if self._limit is not None and len(self.sets) >= self._limit:
             return f"{self._limit} trials are done"

@@ -1,4 +1,4 @@
-"""Scans that are prepared once for all drives along a stretch."""
+"""Scans that are prepared once for all drives along a segment."""
 
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from adaptune.machine import freeing_large_arrays
+from adaptune._system.machine import freeing_large_arrays
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.prepared import prepared_bytes
 from adaptune.recording.scan import Recording, Scan, SequenceError
-from offline.stretches import Stretch
+from offline.frames import Segment
 
 
 @dataclass
 class _Kept:
-    """What a stretch was prepared to in one way."""
+    """What a segment was prepared to in one way."""
 
     scans: dict[int, Any] = field(default_factory=dict)  # by number
     nbytes: int = 0
@@ -30,7 +30,7 @@ SharedScan = Callable[[OdometryInstance], Any]
 
 
 class SharedScans:
-    """The scans of stretches, each prepared once for all instances with the same preparation.
+    """The scans of segments, each prepared once for all instances with the same preparation.
 
     Prepared scans that exceed `memory` bytes are read and prepared again on every pass, once for
     all that share it. What was asked for longest ago makes room for what is asked for more often.
@@ -42,10 +42,10 @@ class SharedScans:
         self._kept: dict[tuple[Hashable, ...], _Kept] = {}
         self._n_passes = 0
 
-    def along(self, stretch: Stretch, scans: Recording) -> Iterator[SharedScan]:
-        """Pass along a stretch of a recording; scans are read where they are asked for."""
+    def along(self, segment: Segment, scans: Recording) -> Iterator[SharedScan]:
+        """Pass along a segment of a recording; scans are read where they are asked for."""
         self._n_passes += 1
-        numbered = enumerate(_scans_of(stretch, scans))
+        numbered = enumerate(_scans_of(segment, scans))
         last: tuple[int, Any] = -1, None
 
         def read(i: int) -> Any:
@@ -54,8 +54,8 @@ class SharedScans:
                 last = next(numbered)
             return last[1]
 
-        for i in range(len(stretch.stamps)):
-            yield partial(self._prepared, stretch.key, i, partial(read, i), {})
+        for i in range(len(segment.stamps)):
+            yield partial(self._prepared, segment.key, i, partial(read, i), {})
 
     def _prepared(
         self,
@@ -89,15 +89,15 @@ class SharedScans:
             fresh[preparation] = prepared
         return prepared
 
-    def milliseconds(self, stretch: Stretch, instance: OdometryInstance) -> float:
-        """Mean CPU time that it took to prepare a scan of a stretch for such an instance."""
-        kept = self._kept.get((*stretch.key, instance.preparation))
+    def milliseconds(self, segment: Segment, instance: OdometryInstance) -> float:
+        """Mean CPU time that it took to prepare a scan of a segment for such an instance."""
+        kept = self._kept.get((*segment.key, instance.preparation))
         return 1e3 * kept.seconds / kept.n_prepared if kept and kept.n_prepared else 0.0
 
     def _has_room(self, size: int, since: int) -> bool:
         """Whether so many bytes more are allowed; make room of what has no use since a pass.
 
-        So stretches that are driven by turns, and do not fit together, do not drive each other out.
+        So segments that are driven by turns, and do not fit together, do not drive each other out.
         """
         if self.nbytes + size <= self._memory:
             return True
@@ -109,12 +109,12 @@ class SharedScans:
         return self.nbytes + size <= self._memory
 
 
-def _scans_of(stretch: Stretch, scans: Recording) -> Iterator[Scan]:
-    """Read the scans of a stretch; a SequenceError if that fails, or they have changed."""
+def _scans_of(segment: Segment, scans: Recording) -> Iterator[Scan]:
+    """Read the scans of a segment; a SequenceError if that fails, or they have changed."""
     again = "run the same command again"
     try:
-        read = scans.since(int(stretch.stamps[0]))
-        for stamp in stretch.stamps.tolist():
+        read = scans.since(int(segment.stamps[0]))
+        for stamp in segment.stamps.tolist():
             scan = next((one for one in read if one.stamp >= stamp), None)
             if scan is None or scan.stamp != stamp:
                 raise SequenceError(f"{scans.name}: has other scans than before; {again}")

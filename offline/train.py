@@ -11,36 +11,34 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import __version__, manifest, trial_rows, yaml12
-from adaptune.archive import Archive, Summary
+from adaptune import __version__
+from adaptune._system import manifest, yaml12
+from adaptune._system.files import write_text
+from adaptune._system.machine import available, spare_memory
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
-from adaptune.machine import available, spare_memory
 from adaptune.metrics import cap, span
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.paired import Pair, Ratio, in_cell, ratio
-from adaptune.progress import Progress, unseen
 from adaptune.report import tables
+from adaptune.runs.archive import Archive, TrialSummary
 from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import ANY, COST, EQUAL, FILES, lost_in_words
 from adaptune.study.references import (
     ensure_references,
-    estimates_as_data,
     estimates_in_words,
     estimates_of,
 )
 from adaptune.study.study import FIXED_SET
-from offline.bare import bare_in_words, in_whole_drives
+from offline.bank_choice import choose, recommends_bank, reserve
 from offline.campaign import (
     Campaign,
     Schedule,
-    drive_whole,
     forecast,
-    read_whole_drives,
     run_baseline,
 )
 from offline.choice import NothingUsableError
@@ -49,15 +47,16 @@ from offline.drive import TrialSetup
 from offline.front import front_rows, in_short, left_out
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
-    Verdict,
+    JudgedSet,
     baseline_words,
     failed_in_words,
-    judge,
     label,
     unread_in_words,
+    weighted,
 )
 from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
-from offline.tuning import choose, recommends_bank, reserve
+from offline.trial_table import of_each, rows
+from offline.whole import bare_in_words, drive_whole, in_whole_drives
 from offline.workers import Cluster, Pool, Workers
 
 _log = logging.getLogger(__name__)
@@ -109,10 +108,10 @@ def train(
     archive = _ready_archive(study, progress)
     config, names, space = study.config.offline, study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
-        verdicts, ended = _searched(study, archive, workers, progress, clock)
-        finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
-        tried = tuple(verdict.parameters for verdict in verdicts.values())
-        every_set = ParameterSets(space, tuple(verdicts), tried)
+        done, ended = _searched(study, archive, workers, progress, clock)
+        finished = {name: {n: archive.finished(name)[n] for n in done} for name in names}
+        tried = tuple(one.parameters for one in done.values())
+        every_set = ParameterSets(space, tuple(done), tried)
         data = labelled_data(study, archive, every_set)
 
         def drive(data: LabelledData) -> None:
@@ -121,41 +120,40 @@ def train(
 
         judged = data.usable()
         usable = in_whole_drives(judged, archive, config, drive)
-    whole = read_whole_drives(archive, names, [*usable.finalists(), *every_set.defaults])
+    whole = archive.summaries(names, [*usable.finalists(), *every_set.defaults])
     fixed, equal_cost, any_cost = usable.front()[1:4]
     dropped = sorted({*judged.sets} - {*usable.sets})
     data = data._replace(costs=(usable.beside or data.costs).without(dropped))
-    model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
+    model = _fit_and_save(study, data, with_vectors(usable, archive), finished, fixed)
     write_sets(study, every_set[fixed], {EQUAL: every_set[equal_cost], ANY: every_set[any_cost]})
-    trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
+    trials = _trial_rows(config, rows(archive, names), done)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
-    errors = {name: stored.error(model.length) for name, stored in estimates.items()}
-    rows = _training_rows(usable, finished, fixed, whole, errors, config)
-    tables.write_rows(study.folder, "training", rows)
+    in_training = _training_rows(usable, finished, fixed, whole, config)
+    tables.write_rows(study.folder, "training", in_training)
     best = f"the fixed set, the best of {len(trials)} parameter sets,"
-    said = lost_in_words(study, best, {row["sequence"]: row["fixed, whole"] for row in rows})
+    said = lost_in_words(study, best, {row["sequence"]: row["fixed, whole"] for row in in_training})
     said += estimates_in_words(estimates, model.length)
-    said += baseline_words(config, [runs[0] for runs in finished.values()])
+    said += baseline_words(config, [of[0] for of in finished.values()])
     of_bare, worse = bare_in_words(archive, whole, fixed, dropped)
     said += of_bare
     rows_of_front = front_rows(usable, model, left_out(judged, usable, model, worse))
     tables.write_rows(study.folder, "front", rows_of_front)
-    failed = [*ended, *unread_in_words(finished), *failed_in_words(verdicts)]
-    return Training(model, trials, rows, said, failed, rows_of_front)
+    failed = [*ended, *unread_in_words(finished), *failed_in_words(done)]
+    return Training(model, trials, in_training, said, failed, rows_of_front)
 
 
-def _left_out(others: LabelledData, drives: Mapping[int, Summary]) -> float | None:
+def _left_out(others: LabelledData, drives: Mapping[int, TrialSummary]) -> float | None:
     """Error on a sequence, whose drives these are, of the set that other recordings choose."""
     with contextlib.suppress(NothingUsableError):
-        if others.sequences and (run := drives.get(others.fixed())):
-            return run.mean_error
+        if others.sequences and (drive := drives.get(others.fixed())):
+            return drive.mean_error
     return None
 
 
 def _searched(
     study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Stopwatch
-) -> tuple[dict[int, Verdict], list[str]]:
+) -> tuple[dict[int, JudgedSet], list[str]]:
     """Drive the baseline, say how long the rest takes, and try sets; what time has left out."""
     run_baseline(study, archive, workers, progress)
     expected, config = forecast(study, archive, len(workers.workers()), clock), study.config.offline
@@ -168,10 +166,10 @@ def _searched(
     return campaign.run(), campaign.words
 
 
-def _say_so_far(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]) -> None:
+def _say_so_far(study: OfflineStudy, archive: Archive, judged: Mapping[int, JudgedSet]) -> None:
     """Say what the sets of the portfolio recommend, before others are tried."""
-    tried = tuple(verdict.parameters for verdict in verdicts.values())
-    sets = ParameterSets(study.odometry.space, tuple(verdicts), tried)
+    tried = tuple(one.parameters for one in judged.values())
+    sets = ParameterSets(study.odometry.space, tuple(judged), tried)
     try:
         said = in_short(labelled_data(study, archive, sets).usable())
     except AdaptuneError as why:  # what follows may be usable, or within the budget
@@ -238,7 +236,7 @@ def trial_workers(
     return Cluster(setup, names, cluster) if cluster else Workers(setup, n, spare_memory())
 
 
-def _fitted(
+def _fit_and_save(
     study: OfflineStudy, data: LabelledData, usable: LabelledData, finished: Finished, fixed: int
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
@@ -246,16 +244,13 @@ def _fitted(
     settings = config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
     versions = {"adaptune": __version__, "numpy": np.__version__} | study.odometry.content
     provenance = {"versions": versions} | settings | {"inputs": manifest.digest(inputs)}
-    estimates = estimates_of(study.sequences, study.training)
-    if judged := estimates_as_data(estimates, config.sub_trajectory):
-        provenance |= {"estimated_references": judged}
-    trials = {
-        name: {
-            n: (run.mean_error, run.restarts, judge(config.offline, [run])) for n, run in of.items()
-        }
-        for name, of in finished.items()
-    }
-    switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
+
+    def evidence(trial: TrialSummary) -> tuple[Any, ...]:
+        value = weighted(config.offline.objective, trial.metrics)
+        return trial.mean_error, trial.restarts, (trial.parameters, value, trial.failure)
+
+    trials = {name: {n: evidence(run) for n, run in of.items()} for name, of in finished.items()}
+    switching = config.online.switching.model_dump(mode="json", include={"size"})
     online = (config.online.period, config.online.budget, data.cores, switching)
     provenance["evidence"] = manifest.digest((trials, online, fixed))
     model = None
@@ -265,24 +260,24 @@ def _fitted(
         identity, length = study.odometry.identity, config.sub_trajectory
         model = fit(data, fixed, identity, length, study.window, provenance)
         model = replace(model, budget=config.online.budget, milliseconds=data.budget)
-        model = tuned(model, usable, config.online.switching)
+        model = with_bank(model, usable, config.online.switching)
         model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
 
 
 def _trial_rows(
-    config: OfflineConfig, table: Sequence[dict[str, Any]], verdicts: Mapping[int, Verdict]
+    config: OfflineConfig, table: Sequence[dict[str, Any]], judged: Mapping[int, JudgedSet]
 ) -> list[dict[str, Any]]:
     """A row for every trial: as `adaptune trials` lists it, and how it was judged."""
     rows = []
     for row in table:
-        if (verdict := verdicts.get(row["trial"])) is None:
+        if (tried := judged.get(row["trial"])) is None:
             continue
         row[COST] = row.pop("cost")
-        row["state"] = verdict.state
+        row["state"] = tried.state
         if set(config.objective) != {"rte"}:
-            row[label(config.objective)] = verdict.value
+            row[label(config.objective)] = tried.value
         rows.append(row)
     return rows
 
@@ -292,32 +287,27 @@ def _training_rows(
     finished: Finished,
     fixed: int,
     whole: Finished,
-    reference_errors: Mapping[str, float],
     config: OfflineConfig,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence, with the set that has the least error there."""
     rows = []
     for sequence in usable.sequences:
-        name, runs = sequence.name, finished[sequence.name]
-        values = {n: v.value for n, run in runs.items() if not (v := judge(config, [run])).failure}
-        best = min(values, key=values.__getitem__)
-        error = reference_errors.get(name)
-        row = {
-            "sequence": name,
-            "baseline": runs[0].mean_error,
-            "fixed": runs[fixed].mean_error,
-            "own best": runs[best].mean_error,
-            "restarts, baseline": round(runs[0].restarts),
-            "restarts, fixed": round(runs[fixed].restarts),
-            "baseline, whole": whole[name][0].mean_error,
-            "fixed, whole": whole[name][fixed].mean_error,
-            "_own best trial": best,
-            "_reference": "given" if error is None else "estimated",
-            "_reference_error": error,
-        }
-        own = usable.sets.space.row(runs[best].parameters)
-        row |= {f"_own best {key}": value for key, value in own.items()}
-        rows.append(row | {"_left out": _left_out(usable.without(sequence), whole[name])})
+        name, trials = sequence.name, finished[sequence.name]
+        sound = (trial for trial in trials.values() if not trial.failure)
+        best = min(sound, key=lambda trial: weighted(config.objective, trial.metrics))
+        rows.append(
+            {
+                "sequence": name,
+                "baseline": trials[0].mean_error,
+                "fixed": trials[fixed].mean_error,
+                "own best": best.mean_error,
+                "restarts, baseline": round(trials[0].restarts),
+                "restarts, fixed": round(trials[fixed].restarts),
+                "baseline, whole": whole[name][0].mean_error,
+                "fixed, whole": whole[name][fixed].mean_error,
+                "_left out": _left_out(usable.without(sequence), whole[name]),
+            }
+        )
     return rows
 
 
@@ -344,12 +334,12 @@ def fit(
         errors=data.errors(),
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
-        stretch=np.concatenate([s.stretch for s in sequences]),
+        segment=np.concatenate([s.segment for s in sequences]),
         costs=data.costs,
     )
 
 
-def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
+def with_bank(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose the bank and the settings of its weights, and whether it is recommended."""
     chosen = choose(usable, switching.size)
     members = chosen.members or [model.fixed]
@@ -396,15 +386,15 @@ def _on_test(
 ) -> tuple[Archive, list[str]]:
     """Run sets as trials on the test sequences with a reference; where they are, and on which."""
     study.open()
-    names, archive = _judged(study, progress), study.archive(kind)
+    names, archive = _ensure_test_references(study, progress), study.archive(kind)
     archive.begin()
     archive.tidy()
     schedule = Schedule(study, archive, "runs on test sequences", progress, measure=False)
     for name in names:
         schedule.need(name)
         for n in numbers:
-            run = archive.finished(name).get(n)
-            if run is None or run.parameters != model.sets[n]:
+            trial = archive.finished(name).get(n)
+            if trial is None or trial.parameters != model.sets[n]:
                 schedule.add(name, n, model.sets[n])
     if schedule.waits():
         with trial_workers(study, names, cluster) as workers:
@@ -414,7 +404,7 @@ def _on_test(
     return archive, names
 
 
-def odometry_rows(
+def run_odometries(
     study: OfflineStudy,
     training: Training,
     progress: Progress = unseen,
@@ -426,7 +416,7 @@ def odometry_rows(
     is. Ratios, with 95 % intervals, are to the baseline's error. No rows for a single odometry.
     """
     labels, model, rows = list(study.config.odometries), training.model, list[dict[str, Any]]()
-    for one, (own, best) in trial_rows.of_each(training.trials).items():
+    for one, (own, best) in of_each(training.trials).items():
         for row in [own] + [best] * (best is not own):
             which = "its own parameters" if row is own else f"trial {row['trial']}"
             about = {"odometry": one, "set": which, "training [%]": row["mean"]}
@@ -466,7 +456,7 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     return list(chosen)[:n]
 
 
-def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
+def _ensure_test_references(study: OfflineStudy, progress: Progress) -> list[str]:
     """The test sequences that have a reference, or get an estimated one."""
     test, length = study.config.test, study.config.sub_trajectory
     refused = ensure_references(study.sequences, test, length, progress, required=False)

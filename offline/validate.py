@@ -1,6 +1,6 @@
 """Validate a study: find whether adapting would pay in places that it was not trained on.
 
-Recordings or stretches are left out in turn. A fixed set, and what is driven instead of it, are
+Recordings or segments are left out in turn. A fixed set, and what is driven instead of it, are
 chosen on the rest. On what is left out, the errors that were recorded for the sets they choose are
 looked up, period by period; no odometry runs.
 """
@@ -12,20 +12,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, asked, rule_class, selected
+from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, call_user_code, rule_class, selected
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.paired import MIN_BLOCKS, MIN_RECORDINGS, Pair, in_cell, ratio
-from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
-from adaptune.study.driven import PER_STRETCH, driven, expected_in_words
+from adaptune.runs.archive import Archive
+from adaptune.study.driven import PER_SEGMENT, driven, expected_in_words
 from adaptune.study.references import estimates_in_words, estimates_of
-from offline.bare import in_whole_drives
-from offline.charts import stretch_chart
+from offline.bank_choice import (
+    MOST_FOLDS,
+    Figures,
+    bank_errors,
+    choose,
+    figures,
+    log_ratios,
+)
+from offline.charts import segment_chart
 from offline.config import OfflineStudy
 from offline.labelled import (
     LabelledData,
@@ -34,14 +41,7 @@ from offline.labelled import (
     periods,
     with_vectors,
 )
-from offline.tuning import (
-    MOST_FOLDS,
-    Figures,
-    bank_errors,
-    choose,
-    figures,
-    log_ratios,
-)
+from offline.whole import in_whole_drives
 
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
@@ -52,13 +52,13 @@ class ValidationError(AdaptuneError):
 
 
 class LeftOut(NamedTuple):
-    """What happened on one recording, or stretch of it, that was left out."""
+    """What happened on one recording, or segment of it, that was left out."""
 
     name: str
     recording: str  # that it is a part of
-    stretch: NDArray[np.intp]  # (n,): of each frame
+    segment: NDArray[np.intp]  # (n,): of each frame
     span: int  # frames of a sub-trajectory
-    # For every mode the capped error in percent at each frame, of shape (n,).
+    # For every mode the clipped error in percent at each frame, of shape (n,).
     errors: dict[str, NDArray[np.float64]]
     # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
     # share of the weight that the other members had.
@@ -68,10 +68,10 @@ class LeftOut(NamedTuple):
 
 
 def joined(parts: Sequence[LeftOut]) -> LeftOut:
-    """Stretches of a recording that were left out, as one."""
+    """Segments of a recording that were left out, as one."""
     if len(parts) == 1:
         return parts[0]
-    n_frames = [len(part.stretch) for part in parts]
+    n_frames = [len(part.segment) for part in parts]
 
     def mean(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
         return {
@@ -80,7 +80,7 @@ def joined(parts: Sequence[LeftOut]) -> LeftOut:
         }
 
     return parts[0]._replace(
-        stretch=np.concatenate([part.stretch for part in parts]),
+        segment=np.concatenate([part.segment for part in parts]),
         errors={
             mode: np.concatenate([part.errors[mode] for part in parts])
             for mode in _of_all([part.errors for part in parts])
@@ -102,9 +102,9 @@ class Validation:
     left_out: list[LeftOut]  # one of each recording
     # For every mode its mean error over the fixed set's, a number for each recording.
     ratios: dict[str, NDArray[np.float64]] = field(init=False)
-    # For every mode the logarithm of its ratio to the fixed set's error on each stretch.
+    # For every mode the logarithm of its ratio to the fixed set's error on each segment.
     logs: dict[str, NDArray[np.float64]] = field(init=False)
-    recordings: list[str] = field(init=False)  # of each stretch
+    recordings: list[str] = field(init=False)  # of each segment
 
     def __post_init__(self) -> None:
         modes = _of_all([one.errors for one in self.left_out])
@@ -115,11 +115,11 @@ class Validation:
         self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
         self.logs = {
             mode: np.concatenate(
-                [log_ratios(s.errors[mode], s.errors["fixed"], s.stretch) for s in self.left_out]
+                [log_ratios(s.errors[mode], s.errors["fixed"], s.segment) for s in self.left_out]
             )
             for mode in modes
         }
-        self.recordings = [s.recording for s in self.left_out for _ in np.unique(s.stretch)]
+        self.recordings = [s.recording for s in self.left_out for _ in np.unique(s.segment)]
 
     @property
     def modes(self) -> list[str]:
@@ -166,7 +166,7 @@ def leave_one_out(
     rules: Sequence[str] = tuple(RULES),
     among_members: bool = False,
 ) -> Validation:
-    """Leave each recording or stretch out in turn.
+    """Leave each recording or segment out in turn.
 
     What is driven is chosen anew on the rest, by the loss with which a study chooses it. So the
     figures are those of the choice, and not of what was best in hindsight.
@@ -180,10 +180,10 @@ def leave_one_out(
     if len(folds) < 2:
         length = data.sequences[0].simulation.length
         raise ValidationError(
-            f"training: there is one stretch only, or every stretch passes within {length:g} m of "
+            f"training: there is one segment only, or every segment passes within {length:g} m of "
             f"all others, so nothing remains to train on when it is left out. Record "
-            f"{2 * PER_STRETCH * length:g} m or more that do not stay in one place, add "
-            f"recordings, or lower sub_trajectory (two stretches are {2 * PER_STRETCH} "
+            f"{2 * PER_SEGMENT * length:g} m or more that do not stay in one place, add "
+            f"recordings, or lower sub_trajectory (two segments are {2 * PER_SEGMENT} "
             f"sub-trajectories)"
         )
     parts: dict[str, list[LeftOut]] = {}
@@ -206,11 +206,11 @@ def leave_out(
     """Fit on the others, and look up what happens on what is left out; see `leave_one_out`."""
     fitted = data, pca = others.training_data()
     features = pca.transform(sequence.descriptors)
-    capped = cap(sequence.errors)
-    fixed = capped[:, data.sets.column(data.fixed)]
+    clipped = cap(sequence.errors)
+    fixed = clipped[:, data.sets.column(data.fixed)]
     first, period = periods(sequence.period)
-    frames = np.arange(len(capped))
-    errors, adapted = {"baseline": capped[:, data.sets.column(BASELINE)], "fixed": fixed}, {}
+    frames = np.arange(len(clipped))
+    errors, adapted = {"baseline": clipped[:, data.sets.column(BASELINE)], "fixed": fixed}, {}
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs, members = others.costs.alone, dict[str, float](), tuple(chosen.members)
     of_bank, some = data, members or (data.fixed,)
@@ -218,10 +218,10 @@ def leave_out(
         vectors = others.vectors(members) if members else None
         of_bank = replace(data, candidates=some, vectors=vectors)
     for name in (name for name in rules if name not in (ADAPTIVE, STANDBY)):
-        rule = asked(rule_class(name).of, None)
-        asked(rule.fit, of_bank)
+        rule = call_user_code(rule_class(name).of, None)
+        call_user_code(rule.fit, of_bank)
         trials = [selected(rule, data.sets, features[i]).trial for i in first]
-        errors[name] = capped[frames, data.sets.columns(trials)[period]]
+        errors[name] = clipped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
         costs[name] = float(np.mean([alone(trial) for trial in trials]))
         if among_members and members:  # all of them run
@@ -234,8 +234,8 @@ def leave_out(
         adapted[ADAPTIVE] = float(1.0 - weights[:, 0].mean())
         costs[ADAPTIVE] = others.costs.adaptive(members)
     # The best set in hindsight.
-    errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    about = (sequence.name, sequence.recording, sequence.stretch, sequence.span)
+    errors["oracle, sequence"] = clipped[:, int(np.argmin(clipped.mean(axis=0)))]
+    about = (sequence.name, sequence.recording, sequence.segment, sequence.span)
     return LeftOut(*about, errors, adapted, costs)
 
 
@@ -252,9 +252,9 @@ class Validated(NamedTuple):
 def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
-    The study's folder receives ``validation`` (CSV, JSON and a picture) and ``stretches`` (CSV,
+    The study's folder receives ``validation`` (CSV, JSON and a picture) and ``segments`` (CSV,
     JSON). There is a ModelError if there is no model yet, or it is not this study's; a
-    ValidationError if there is only one stretch.
+    ValidationError if there is only one segment.
     """
     model = study.model()
     if (study.training, study.window) != (model.sequences, model.window):
@@ -272,9 +272,9 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         raise ValidationError(f"{error}. {online}") from error
     rows = _rows(validation)
     tables.write_rows(study.folder, "validation", rows)
-    stretches = _stretch_rows(validation)
-    tables.write_rows(study.folder, "stretches", stretches)
-    if (chart := stretch_chart(stretches)) is not None:
+    segments = _segment_rows(validation)
+    tables.write_rows(study.folder, "segments", segments)
+    if (chart := segment_chart(segments)) is not None:
         draw_chart(chart, *(study.folder / f"validation.{kind}" for kind in ("png", "svg")))
     said = [online, *_verdicts(study.rules, bank > 0, validation)]
     estimates = estimates_of(study.sequences, study.training)
@@ -294,7 +294,7 @@ def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> lis
 
 def baseline_in_words(validation: Validation) -> str:
     """How the baseline compares; the study's own fixed set is another than those compared with."""
-    s, parts = validation.summary("baseline"), f"{len(validation.recordings)} stretches"
+    s, parts = validation.summary("baseline"), f"{len(validation.recordings)} segments"
     if s["low"] == s["high"]:
         return f"Without what is left out, the baseline is chosen each time, over {parts}."
     better = ": there the baseline is better" if s["high"] < 1.0 else ""
@@ -349,15 +349,15 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
     return rows
 
 
-def _stretch_rows(validation: Validation) -> list[dict[str, Any]]:
-    """Mean error of the fixed set, and ratios to it, on each stretch."""
+def _segment_rows(validation: Validation) -> list[dict[str, Any]]:
+    """Mean error of the fixed set, and ratios to it, on each segment."""
     logs = {mode: of for mode, of in validation.logs.items() if mode != "fixed"}
     rows: list[dict[str, Any]] = []
     for one in validation.left_out:
-        for number in np.unique(one.stretch):
-            fixed = one.errors["fixed"][one.stretch == number]
+        for number in np.unique(one.segment):
+            fixed = one.errors["fixed"][one.segment == number]
             rows.append(
-                {"recording": one.name, "stretch": int(number), "fixed [%]": float(fixed.mean())}
+                {"recording": one.name, "segment": int(number), "fixed [%]": float(fixed.mean())}
                 | {mode: float(np.exp(of[len(rows)])) for mode, of in logs.items()}
             )
     return rows

@@ -20,20 +20,20 @@ from uuid import uuid4
 import numpy as np
 
 from adaptune import __version__
-from adaptune.archive import Frames
+from adaptune._system.forking import end_with_parent, fork_server
+from adaptune._system.machine import pin, spare_memory
+from adaptune._system.processes import how_it_ended
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
-from adaptune.forking import end_with_parent, fork_server
-from adaptune.machine import pin, spare_memory
-from adaptune.processes import how_it_ended
-from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.scan import Recording
+from adaptune.runs.archive import Frames
+from adaptune.runs.record import Run
 from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
-from offline.drive import Drive, TrialSetup, drive_sets
-from offline.frames import describe, with_measured_hops
+from offline.drive import TrialSetup, drive_sets
+from offline.frames import Segment, describe, with_measured_hops
 from offline.shared_scans import SharedScans
-from offline.stretches import Stretch
 
 MOST_DEATHS = 3
 """A task fails after so many workers have died at it."""
@@ -50,7 +50,7 @@ class Task(NamedTuple):
 
     sequence: str
     frames: Frames | None = None  # whose hops are measured
-    stretch: Stretch | None = None  # along which sets are driven
+    segment: Segment | None = None  # along which sets are driven
     sets: Mapping[int, ParameterSet] = {}  # by trial number, what is driven on one pass
     most: float = np.inf  # seconds of CPU time above which a set is stopped
     bare: bool = False  # without the health check
@@ -60,14 +60,14 @@ class Task(NamedTuple):
     @property
     def key(self) -> Hashable:
         """Identifies it among the tasks of a run, also when it is run again."""
-        return self.sequence, None if self.stretch is None else self.stretch.key, *self.sets
+        return self.sequence, None if self.segment is None else self.segment.key, *self.sets
 
     def __str__(self) -> str:
         trials = f"trials {', '.join(map(str, self.sets))}" if self.sets else "its scans"
         return f"{self.sequence}, {trials}"
 
 
-Result = Frames | Mapping[int, Sequence[Drive]]
+Result = Frames | Mapping[int, Sequence[Run]]
 """Of a task: the frames, or by trial number the drives, one for every repeat."""
 
 
@@ -228,7 +228,7 @@ class Bench:
     def run(self, task: Task, progress: Progress) -> Result:
         """Do a task."""
         setup = self._setup
-        if (stretch := task.stretch) is None and task.frames is None:
+        if (segment := task.segment) is None and task.frames is None:
             return describe(setup.config, setup.sequences, task.sequence, progress)
         if task.sequence not in self._recordings:
             self._recordings[task.sequence] = setup.sequences.open(task.sequence)
@@ -239,9 +239,9 @@ class Bench:
         if task.isolated not in self._shared:  # other instances take scans in another way
             self._shared = {task.isolated: SharedScans(self._memory)}
         shared, sets = self._shared[task.isolated], task.sets
-        assert stretch is not None
+        assert segment is not None
         limits = task.most, task.bare
-        drives = drive_sets(setup, shared, scans, stretch, sets.values(), *limits, progress)
+        drives = drive_sets(setup, shared, scans, segment, sets.values(), *limits, progress)
         return dict(zip(sets, drives, strict=True))
 
 

@@ -21,10 +21,10 @@ from adaptune.report.charts import (
     Words,
     shares,
 )
+from adaptune.runs.record import switched
 from adaptune.space import IN_DOUBT
 from online.modes import BASELINE, FIXED, WITHOUT_MODEL
-from online.record import switched
-from online.replayed import ModeReplay, ReplayedSequence
+from online.replayed import JudgedRun, ReplayedSequence
 from online.statistics import ALL, ComparisonRow
 
 _LINE, _BELOW = 0.12, 0.3
@@ -74,6 +74,8 @@ TIME = Axis("time [s]")
 _MOST_PLACES = 200
 """Points of a path; more would hide each other."""
 _RESTARTED = "restarted by the health check"
+_MARKS = {"lost": ("lost: left out, or restarts", "cross"), "late": ("late, or removed", "square")}
+"""Names and shapes of the marks where a member of a bank does not work, by its state."""
 
 
 def charts_of_replays(replayed: ReplayedSequence) -> Charts:
@@ -92,7 +94,7 @@ def error_chart(replayed: ReplayedSequence) -> Chart | None:
     if any(np.isfinite(track.errors).any() for track in replayed.modes.values()):
         panels.append(_errors(replayed))
     for mode, track in replayed.modes.items():
-        if np.isfinite(track.estimated[:, 0]).any() or _in_doubt(track).any():
+        if np.isfinite(track.run.estimated[:, 0]).any() or _in_doubt(track).any():
             panels.append(_estimates(mode, track, replayed))
     if not panels:
         return None
@@ -115,22 +117,23 @@ def _errors(replayed: ReplayedSequence) -> Panel:
     drawn = _scenes(replayed)
     drawn += [Line(track.seconds, track.errors, mode) for mode, track in replayed.modes.items()]
     for mode, track in replayed.modes.items():
-        if track.restarted.any():
-            x, y = track.seconds[track.restarted], track.errors[track.restarted]
+        if (restarted := track.run.restarted).any():
+            x, y = track.seconds[restarted], track.errors[restarted]
             texts = [f"{mode}, {seconds:.1f} s" for seconds in x]
             drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
     axis = Axis(f"RTE over the next {replayed.length:g} m [%]", log=True)
     return Panel(TIME, axis, tuple(drawn), height=1.6)
 
 
-def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Panel:
-    seconds, (estimated, low, high) = track.choice_seconds, track.estimated.T
+def _estimates(mode: str, track: JudgedRun, replayed: ReplayedSequence) -> Panel:
+    seconds, states = track.span[:-1], track.states
+    estimated, low, high = track.run.estimated.T
     drawn: list[Drawn] = []
     if (doubted := _in_doubt(track)).any():
         # From a selection at which that changes to the next; what is not shaded has no name.
-        begins = np.flatnonzero(np.append(True, track.states[1:] != track.states[:-1]))
-        names = tuple(str(track.states[i]) if doubted[i] else "" for i in begins)
-        drawn.append(Spans([*seconds[begins], track.seconds[-1]], names, "state"))
+        begins = np.flatnonzero(np.append(True, states[1:] != states[:-1]))
+        names = tuple(str(states[i]) if doubted[i] else "" for i in begins)
+        drawn.append(Spans([*seconds[begins], track.span[-1]], names, "state"))
     if np.isfinite(track.errors_behind).any():
         judge = "by the estimated reference" if replayed.estimated else "true"
         drawn.append(Line(track.seconds, track.errors_behind, judge))
@@ -142,13 +145,13 @@ def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Pane
     return Panel(TIME, y, tuple(drawn), f"{mode}: its error as measured while driving")
 
 
-def _in_doubt(track: ModeReplay) -> NDArray[np.bool_]:
+def _in_doubt(track: JudgedRun) -> NDArray[np.bool_]:
     return np.isin(track.states, list(IN_DOUBT))
 
 
 def choice_chart(replayed: ReplayedSequence) -> Chart | None:
     """What every mode applied along the course: its parameters, or the weights of its bank."""
-    panels = [*_parameters(replayed), *_weights(replayed)]
+    panels = [*_parameters(replayed), *_weights(replayed), *_at_work(replayed)]
     if not panels:
         return None
     return Chart(
@@ -165,8 +168,8 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
 
 def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
     single = {mode: track for mode, track in replayed.modes.items() if not track.weights}
-    for name in dict.fromkeys(name for track in single.values() for name in track.choices):
-        chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
+    for name in dict.fromkeys(name for track in single.values() for name in track.run.values):
+        chosen = {mode: t.run.values[name] for mode, t in single.items() if name in t.run.values}
         if all(len({*map(repr, values)}) < 2 for values in chosen.values()):
             continue
         every = [value for values in chosen.values() for value in values]
@@ -208,6 +211,25 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         drawn = (*_scenes(replayed), *shares(track.span, parts, track.weights), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
+
+
+def _at_work(replayed: ReplayedSequence) -> Iterator[Panel]:
+    """When the members of a bank work, where one does not always."""
+    for mode, track in replayed.modes.items():
+        states = np.array(list(track.members.values()))
+        if not states.size or np.isin(states, ["works", ""]).all():
+            continue
+        rows, seconds = np.indices(states.shape)[0], np.broadcast_to(track.seconds, states.shape)
+        # Until the next scan, so that a single one is seen.
+        works = states == "works"
+        works[:, 1:] |= works[:, :-1]
+        each = zip(track.members, np.where(works, rows, np.nan), strict=True)
+        drawn: list[Drawn] = [Line(track.seconds, y, name, width=7.0) for name, y in each]
+        for state, (name, shape) in _MARKS.items():
+            if (at := states == state).any():
+                drawn.append(Points(seconds[at], rows[at], name, shape=shape))
+        title = f"{mode}: which members of its bank work; where there is nothing, one rests"
+        yield Panel(TIME, Axis("", names=tuple(track.members)), tuple(drawn), title, height=0.3)
 
 
 def _scenes(replayed: ReplayedSequence) -> list[Drawn]:
@@ -305,7 +327,8 @@ def _chosen(replayed: ReplayedSequence) -> Iterator[Panel]:
     if track.weights:
         yield from _weights(replace(replayed, modes={mode: track}))
     elif track.adapts:
-        changes = {name: switched({name: values}).sum() for name, values in track.choices.items()}
+        chosen = track.run.values
+        changes = {name: switched({name: values}).sum() for name, values in chosen.items()}
         most = max(changes, key=lambda name: changes[name])
         if changes[most]:
             (panel,) = (panel for panel in _parameters(replayed) if panel.title == most)

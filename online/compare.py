@@ -15,13 +15,14 @@ from adaptune.model.registry import ADAPTIVE
 from adaptune.paired import Ratio, ratio
 from adaptune.reference.judge import StandardErrors
 from adaptune.report import tables as report
+from adaptune.runs.files import StoredReplayError
+from adaptune.runs.record import NO_RUN
 from adaptune.space import ODOMETRY
 from adaptune.study.config import ALSO
-from adaptune.study.driven import PER_STRETCH, lost_in_words
+from adaptune.study.driven import PER_SEGMENT, lost_in_words
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
 from online.modes import BASELINE, EVEN, FIXED, WITHOUT_MODEL, Replays, sequences_without_model
-from online.record import StoredReplayError
 from online.reference import read_contradictions, read_reference
 from online.statistics import (
     ALL,
@@ -91,7 +92,7 @@ def compared_modes(replays: Replays) -> ComparedModes:
 
 AS_WRONG = 0.5
 """Share of the baseline's error in training from which an estimated reference can rank no sets."""
-LEAST_STRETCHES = 10
+LEAST_SEGMENTS = 10
 """With fewer, there is no worst tenth."""
 
 
@@ -113,8 +114,8 @@ def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
     row = _mean_row(mode, rows)
     if mode == row.yardstick:
         return row
-    logs = _of_stretches(judged, mode)
-    enough = len(logs) >= LEAST_STRETCHES
+    logs = _of_segments(judged, mode)
+    enough = len(logs) >= LEAST_SEGMENTS
     return replace(
         row,
         ratio_interval=ratio_to(judged, mode).interval,
@@ -125,22 +126,22 @@ def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
 
 
 def _mean_row(mode: str, rows: Sequence[ComparisonRow]) -> ComparisonRow:
-    ratios = [row.ratio for row in rows if row.ratio is not None]
+    ratios, runs = [row.ratio for row in rows if row.ratio is not None], [row.run for row in rows]
+    summed = ("restarts", "lost_seconds")
+    of_all = {name: sum(getattr(run, name) for run in runs) for name in summed}
+    of_all["cpu_ms"] = mean_of([run.cpu_ms for run in runs])
+    of_all["memory_mb"] = max((m for run in runs if (m := run.memory_mb) is not None), default=None)
     return ComparisonRow(
         ALL,
         mode,
         mean_of([row.rte for row in rows]),
         float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12))))),
-        sum(row.restarts for row in rows),
+        NO_RUN.model_copy(update=of_all),
         sum(row.switches for row in rows),
-        sum(row.poor_scans for row in rows),
         standard=StandardErrors.pooled([row.standard for row in rows if row.standard]),
         yardstick=rows[0].yardstick,
         estimated=mean_of([row.estimated for row in rows]),
-        lost_seconds=sum(row.lost_seconds for row in rows),
         reference=" and ".join(sorted({row.reference for row in rows})),
-        cpu_ms=mean_of([row.cpu_ms for row in rows]),
-        memory_mb=max((m for row in rows if (m := row.memory_mb) is not None), default=None),
     )
 
 
@@ -149,12 +150,12 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     return ratio([one.pair(mode, other) for one in judged])
 
 
-def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float64]:
-    """Logarithms of the ratio on each stretch: as many whole ones as a sequence has, or one."""
+def _of_segments(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float64]:
+    """Logarithms of the ratio on each segment: as many whole ones as a sequence has, or one."""
     found = []
     for one in judged:
         pair = one.pair(mode)
-        n = max(1, pair.errors.shape[1] // (PER_STRETCH * one.block))
+        n = max(1, pair.errors.shape[1] // (PER_SEGMENT * one.block))
         parts = np.array_split(pair.errors, n, axis=1)
         found += [ratio([pair._replace(errors=part)]).value for part in parts]
     return np.log(found)
@@ -164,7 +165,7 @@ NONE = "none"
 """Advised where track is lost."""
 
 
-class ComparedReplays(NamedTuple):
+class Comparison(NamedTuple):
     """What `compare` has found."""
 
     # A row for every sequence and mode; over several sequences, a row for every mode follows.
@@ -177,7 +178,7 @@ class ComparedReplays(NamedTuple):
     model: ErrorModel | None = None  # of the replays
 
 
-def compare(study: Study) -> ComparedReplays:
+def compare(study: Study) -> Comparison:
     """Compare the replays that were made, see `compared_modes`, and write tables.
 
     ``comparison`` in the study's folder receives ``comparison.csv`` and ``.json``, and the tables
@@ -225,11 +226,11 @@ def compare(study: Study) -> ComparedReplays:
         said += verdict(rows, length, recommended, front, obstacle, tried, whose)
         said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
-    details = [*wrong, *remarks(rows), *compared.words]
+    details = [w for w in (*wrong, *remarks(rows), *compared.words) if w not in said]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
-    return ComparedReplays(rows, said, details, advised, compared.unfinished, front, model)
+    return Comparison(rows, said, details, advised, compared.unfinished, front, model)
 
 
 def _odometries(model: ErrorModel) -> dict[str, str]:
@@ -242,7 +243,7 @@ def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> l
     """Where what is advised has lost its way, and the likeliest cause."""
     of_best = [row for row in rows if row.mode == best.mode and row.sequence != ALL]
     errors = {row.sequence: row.rte for row in of_best if row.rte is not None}
-    faults = [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE]
+    faults = [row.run.fault for row in of_best if row.rte and row.rte > LOST_ABOVE]
     said = lost_in_words(study, called(best.mode), errors, faults)
     return [*said, "Until then, rely on none."] if said else []
 

@@ -9,20 +9,20 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import manifest
+from adaptune._system import manifest
+from adaptune._system.files import write_text
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.paired import Pair, Ratio, in_cell, ratio
 from adaptune.report.tables import Listing, markdown
+from adaptune.runs.files import read_run, read_summary
 from adaptune.space import load_space
-from adaptune.study.driven import PER_STRETCH
+from adaptune.study.driven import PER_SEGMENT
 from adaptune.study.study import Study, is_written_to
 from online.modes import BASELINE, FIXED
-from online.record import ReplaySummary, StoredReplay
 from online.reference import read_reference
 from online.statistics import ALL
-from online.turns import COST, P99, Costs, Driven, cost_ratios
+from online.turns import COST, P99, Costs, StoredReplay, cost_ratios
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
@@ -35,37 +35,30 @@ _NO_COST = 0.5
 """Milliseconds a scan by which the same code differs, where other work shares the caches."""
 
 
-class Side(NamedTuple):
-    """Replays of one side."""
+def stored_replays(study: Study, mode: str) -> dict[str, StoredReplay]:
+    """What was replayed with the set of a mode, by content and part of the recording."""
 
-    name: str
-    study: Study
+    def is_of_mode(inputs: manifest.Inputs) -> bool:
+        space = load_space(inputs["odometry"]["parameters"])
+        wanted = study.fixed if mode == FIXED else space.baseline
+        return wanted is not None and inputs["parameters"] == wanted
 
-    def replays(self, mode: str) -> dict[str, Driven]:
-        """What was replayed with the set of a mode, by content and part of the recording."""
-        study = self.study
-
-        def is_of_mode(inputs: manifest.Inputs) -> bool:
-            space = load_space(inputs["odometry"]["parameters"])
-            wanted = study.fixed if mode == FIXED else space.baseline
-            return wanted is not None and inputs["parameters"] == wanted
-
-        # Earlier ones may be of recordings that the study does not name any more.
-        found = [
-            Driven(study, name, path.parent, ReplaySummary.read(path.parent))
-            for name in sorted([*study.config.sequences, *study.config.courses])
-            for path in (study.folder / "replays" / name).glob("*/replay.json")
-        ]
-        found = [one for one in found if is_of_mode(one.summary.inputs)]
-        # Of several, that which would be made now, or the last one.
-        found.sort(key=lambda one: (not one.obstacle, one.made))
-        return {_key(one): one for one in found}
+    # Earlier ones may be of recordings that the study does not name any more.
+    found = [
+        StoredReplay(study, name, path.parent, read_summary(path.parent))
+        for name in sorted([*study.config.sequences, *study.config.courses])
+        for path in (study.folder / "replays" / name).glob("*/replay.json")
+    ]
+    found = [one for one in found if is_of_mode(one.summary.inputs)]
+    # Of several, that which would be made now, or the last one.
+    found.sort(key=lambda one: (not one.obstacle, one.made))
+    return {_key(one): one for one in found}
 
 
-class Paired(NamedTuple):
+class PairedReplays(NamedTuple):
     """Both sides on a recording, new first."""
 
-    both: tuple[Driven, Driven]
+    both: tuple[StoredReplay, StoredReplay]
     pair: Pair  # the errors, at the scans where both are known
     seconds: NDArray[np.float64]  # (n,): of these, from the first scan
     restarts: tuple[int, int]
@@ -89,13 +82,13 @@ class GateRow(NamedTuple):
     low: float | None = None  # ends of the ratio's interval
     high: float | None = None
     why: str = ""
-    # Of errors: by stretch, seconds from the first scan and the ratio there.
-    stretches: tuple[tuple[float, float], ...] = ()
+    # Of errors: by segment, seconds from the first scan and the ratio there.
+    segments: tuple[tuple[float, float], ...] = ()
 
     def columns(self) -> dict[str, Any]:
         """The row of a table."""
         ends = None if self.low is None or self.high is None else (self.low, self.high)
-        worst = max(self.stretches, key=lambda stretch: stretch[1], default=None)
+        worst = max(self.segments, key=lambda segment: segment[1], default=None)
         return {
             "recording": self.recording,
             "of": _UNITS.get(self.quantity, self.quantity),
@@ -104,7 +97,7 @@ class GateRow(NamedTuple):
             "ratio": self.ratio,
             "interval": ends and in_cell(ends, 3),
             "verdict": self.verdict + (f": {self.why}" if self.why else ""),
-            "worst stretch": worst and f"{worst[1]:.2f} at {worst[0]:.0f} s",
+            "worst segment": worst and f"{worst[1]:.2f} at {worst[0]:.0f} s",
         }
 
 
@@ -133,17 +126,17 @@ def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
     return "equal" if high <= 1.0 + bound else "unclear"
 
 
-class Shared(NamedTuple):
+class SharedReplays(NamedTuple):
     """What both sides have replayed."""
 
-    new: Side
-    old: Side
+    new: Study
+    old: Study
     mode: str
-    pairs: list[Paired]
+    pairs: list[PairedReplays]
     alone: str  # in words, the recordings of one side only
 
 
-def shared_replays(new: Side, old: Side) -> Shared:
+def shared_replays(new: Study, old: Study) -> SharedReplays:
     """Pair the replays of two sides by recording, in the mode that both have: fixed, or baseline.
 
     Raises
@@ -152,23 +145,21 @@ def shared_replays(new: Side, old: Side) -> Shared:
         If they have no recording in common, what they share differs, or a side is being driven.
     """
     for side in (new, old):
-        if is_written_to(side.study.folder):
+        if is_written_to(side.folder):
             raise AdaptuneError(
-                f"{side.study.folder}: another adaptune writes to it; run this again when that is "
-                f"done"
+                f"{side.folder}: another adaptune writes to it; run this again when that is done"
             )
-    if new.study.config.sub_trajectory != old.study.config.sub_trajectory:
-        lengths = [f"{side.study.config.sub_trajectory:g} m ({side.name})" for side in (new, old)]
+    if new.config.sub_trajectory != old.config.sub_trajectory:
+        lengths = [f"{side.config.sub_trajectory:g} m ({side.name})" for side in (new, old)]
         raise AdaptuneError(
             f"sub_trajectory: errors over {' and '.join(lengths)} do not compare; give both the "
             f"same with --sub-trajectory"
         )
-    found = {mode: (new.replays(mode), old.replays(mode)) for mode in (FIXED, BASELINE)}
+    found = {m: (stored_replays(new, m), stored_replays(old, m)) for m in (FIXED, BASELINE)}
     for i, side in enumerate((new, old)):
         if not any(both[i] for both in found.values()):
             raise AdaptuneError(
-                f"{side.study.folder}: holds no replays; run `adaptune online` with this study "
-                f"first"
+                f"{side.folder}: holds no replays; run `adaptune online` with this study first"
             )
     if not any(mine and others for mine, others in found.values()):
         first, second = (next(m for m, both in found.items() if both[i]) for i in (0, 1))
@@ -187,25 +178,25 @@ def shared_replays(new: Side, old: Side) -> Shared:
     if not common[mode]:
         raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
     mine, others = found[mode]
-    pairs = [_paired((new, old), (mine[key], others[key])) for key in common[mode]]
-    return Shared(new, old, mode, pairs, alone)
+    pairs = [_paired((mine[key], others[key])) for key in common[mode]]
+    return SharedReplays(new, old, mode, pairs, alone)
 
 
-def _key(one: Driven) -> str:
+def _key(one: StoredReplay) -> str:
     """A recording by its content, and which part of it was driven."""
     inputs = one.summary.inputs
     part = [_settings(one).get(key) for key in ("part", "start", "stop")]
     return manifest.digest([inputs["recording"][one.name], part])
 
 
-def _settings(one: Driven) -> dict[str, Any]:
+def _settings(one: StoredReplay) -> dict[str, Any]:
     inputs = one.summary.inputs
     return dict(inputs["sequences" if "sequences" in inputs else "courses"][one.name])
 
 
-def _check_same(sides: Sequence[Side], both: Sequence[Driven]) -> None:
+def _check_same(both: Sequence[StoredReplay]) -> None:
     """Refuse another pace, another reading of the same recording, and another reference."""
-    words = f"{both[0].name}: {sides[0].name} and {sides[1].name}"
+    words = f"{both[0].name}: {' and '.join(one.study.name for one in both)}"
     inputs = [one.summary.inputs for one in both]
     paces = [of["real_time"] for of in inputs]
     if paces[0] != paces[1]:
@@ -227,17 +218,17 @@ def _check_same(sides: Sequence[Side], both: Sequence[Driven]) -> None:
         raise AdaptuneError(f"{words} are judged by different references; name the same in both")
 
 
-def _paired(sides: Sequence[Side], both: tuple[Driven, Driven]) -> Paired:
-    _check_same(sides, both)
-    old = both[1].summary
+def _paired(both: tuple[StoredReplay, StoredReplay]) -> PairedReplays:
+    _check_same(both)
+    new, old = both[0], both[1].summary
     if (lacking := old.unhealthy.get("no_pose", 0)) >= MAX_SHARE_WITHOUT_POSE * old.scans:
         raise AdaptuneError(
-            f"{both[1].name}: {sides[1].name} gives no pose for {lacking} of {old.scans} scans, so "
-            f"nothing compares with it; mend it, or leave the recording out"
+            f"{both[1].name}: {both[1].study.name} gives no pose for {lacking} of {old.scans} "
+            f"scans, so nothing compares with it; mend it, or leave the recording out"
         )
-    new, reference = both[0], read_reference(sides[0].study, both[0].name)
-    mine, other = (StoredReplay.read(one.folder) for one in both)
+    mine, other = (read_run(one.folder) for one in both)
     stamps = np.intersect1d(mine.trajectory.stamps, other.trajectory.stamps)
+    reference = read_reference(new.study, new.name)
     kept = [(replay, np.isin(replay.trajectory.stamps, stamps)) for replay in (mine, other)]
     errors = np.array([reference.errors(replay.trajectory)[at] for replay, at in kept])
     restarted = np.array([replay.restarted[at] for replay, at in kept])
@@ -246,7 +237,7 @@ def _paired(sides: Sequence[Side], both: tuple[Driven, Driven]) -> Paired:
     pair = Pair(errors[:, known], reference.block, recording, reference.error)
     restarts = new.summary.restarts, old.restarts
     seconds = (stamps[known] - stamps[0]) * 1e-9
-    return Paired(both, pair, seconds, restarts, _places(restarted, reference.block))
+    return PairedReplays(both, pair, seconds, restarts, _places(restarted, reference.block))
 
 
 def _places(restarted: NDArray[np.bool_], block: int) -> tuple[int, int]:
@@ -262,7 +253,7 @@ def _places(restarted: NDArray[np.bool_], block: int) -> tuple[int, int]:
 
 
 def compare_sides(
-    shared: Shared, costs: Mapping[str, Costs | str] | None, error: float, cost: float
+    shared: SharedReplays, costs: Mapping[str, Costs | str] | None, error: float, cost: float
 ) -> Gate:
     """Judge error, cost and restarts; the new side's may be larger by the shares `error`, `cost`.
 
@@ -280,9 +271,9 @@ def compare_sides(
     groups = [*([one] for one in judges.values()), [*judges.values()]]
     ratios = [ratio(group, each) for group in groups if group]
     means = {name: one.errors.mean(axis=1) for name, one in judges.items()}
-    stretches = {pair.name: _stretches(pair) for pair in pairs if pair.name in judges}
+    segments = {pair.name: _segments(pair) for pair in pairs if pair.name in judges}
     for row in _rows(ERROR, pairs, means, ratios, error, {}):
-        rows.append(row._replace(stretches=stretches.get(row.recording, ())))
+        rows.append(row._replace(segments=segments.get(row.recording, ())))
     for quantity in quantities:
         of = {pair.name: known[pair.name][quantity] for pair in pairs if pair.name in known}
         means = {name: one.mean(axis=(1, 2)) for name, one in of.items()}
@@ -292,14 +283,14 @@ def compare_sides(
     rows += [_restarts(pairs, share), *_lacking(pairs)]
     verdict = _overall(rows)
     left_out = f" Not compared: {shared.alone}." if shared.alone else ""
-    words, study = _in_words(shared, verdict, rows) + left_out, shared.new.study
+    words, study = _in_words(shared, verdict, rows) + left_out, shared.new
     length = study.config.sub_trajectory
     return Gate(verdict, rows, words, study.odometry.name, shared.mode, length)
 
 
 def _rows(
     quantity: str,
-    pairs: Sequence[Paired],
+    pairs: Sequence[PairedReplays],
     means: Mapping[str, NDArray[np.float64]],
     ratios: Sequence[Ratio],
     bound: float,
@@ -334,7 +325,7 @@ def _rows(
     return rows
 
 
-def _restarts(pairs: Sequence[Paired], share: float) -> GateRow:
+def _restarts(pairs: Sequence[PairedReplays], share: float) -> GateRow:
     """The row of the restarts over all recordings: where only one side has them, by a sign test."""
     from scipy.special import bdtr  # slow to import
 
@@ -347,7 +338,7 @@ def _restarts(pairs: Sequence[Paired], share: float) -> GateRow:
     return GateRow(ALL if len(pairs) > 1 else pairs[0].name, RESTARTS, new, old, said)
 
 
-def _lacking(pairs: Sequence[Paired]) -> list[GateRow]:
+def _lacking(pairs: Sequence[PairedReplays]) -> list[GateRow]:
     """The row of scans without a pose over all recordings, if there are any."""
     new, old = (sum(pair.both[i].summary.lacking for pair in pairs) for i in range(2))
     # One scan in a hundred may lack its pose on one side by chance.
@@ -357,9 +348,9 @@ def _lacking(pairs: Sequence[Paired]) -> list[GateRow]:
     return [GateRow(name, LACKING, new, old, said)] if new or old else []
 
 
-def _stretches(pair: Paired) -> tuple[tuple[float, float], ...]:
-    """By stretch of `PER_STRETCH` sub-trajectories its first second, and the ratio there."""
-    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.pair.block))
+def _segments(pair: PairedReplays) -> tuple[tuple[float, float], ...]:
+    """By segment of `PER_SEGMENT` sub-trajectories its first second, and the ratio there."""
+    n = max(1, len(pair.seconds) // (PER_SEGMENT * pair.pair.block))
     parts = np.array_split(np.vstack([pair.seconds, pair.pair.errors]), n, axis=1)
     return tuple(
         (round(float(t[0]), 1), float(new.mean() / max(old.mean(), 1e-12))) for t, new, old in parts
@@ -377,7 +368,7 @@ def _overall(rows: Sequence[GateRow]) -> Verdict:
     return "better" if any(row.verdict == "better" for row in over_all) else "equal"
 
 
-def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
+def _in_words(shared: SharedReplays, verdict: Verdict, rows: Sequence[GateRow]) -> str:
     said = {"better": "Better", "worse": "WORSE", "equal": "Not worse"}
     over_all = [row for row in rows if row.recording == ALL] or rows
     parts = []
@@ -401,7 +392,10 @@ def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
 
 
 def write_gate(folder: Path, gate: Gate) -> None:
-    """Write ``verdict.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
+    """Write ``verdict.json``, ``junit.xml`` and ``summary.md``, for a CI service.
+
+    A study has a ``verdict.json`` of its own, which says what to drive: `adaptune.tuning.verdict`.
+    """
     # Of the error over all, which comes last.
     error = [row for row in gate.rows if row.quantity == ERROR][-1]
     data = {

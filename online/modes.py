@@ -10,10 +10,11 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from adaptune import manifest
-from adaptune.bank.bank import WARM_UP, Bank
+from adaptune._system import manifest
+from adaptune._system.machine import available, pin, release_memory
+from adaptune._system.progress import Progress, unseen
+from adaptune.bank.bank import Bank
 from adaptune.errors import AdaptuneError, Finding, OdometryError
-from adaptune.machine import available, pin, release_memory
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
 from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES, STANDBY
@@ -22,11 +23,13 @@ from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.content import python_content
 from adaptune.odometry.factory import Factory, OdometryFactory
 from adaptune.odometry.registry import ROS_SYSTEMS
-from adaptune.progress import Progress, unseen
 from adaptune.recording.config import part_name
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.carried import begin_of, without
 from adaptune.reference.check import mean_difference
+from adaptune.runs.files import StoredReplayError, is_complete, read_run, write_run
+from adaptune.runs.loop import replay
+from adaptune.runs.record import Run
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
 from adaptune.study.config import ALSO, StudyConfig
@@ -35,9 +38,7 @@ from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import Mechanism, Study
 from adaptune.trajectory import Trajectory
 from online.real_time import replay_in_real_time
-from online.record import StoredReplay, StoredReplayError, is_complete, write_replay
 from online.reference import CONTRADICTIONS, reference_folder, write_reference
-from online.replay import ReplayRecord, replay
 from online.selector_process import SelectorProcess
 
 BASELINE, FIXED, EVEN, UNTRAINED = "baseline", "fixed", "even", "untrained"
@@ -148,7 +149,8 @@ class ReplaySetup:
         joins = name in (ADAPTIVE, STANDBY)
         members = self._members(model) if joins else self._always(model)
         make = partial(Selector, model, name, list(members), descriptors)
-        return Mode(name, members, True, make, _cost(model, members))
+        # The reserve rests nearly always.
+        return Mode(name, members, True, make, _cost(model, self._always(model)))
 
     def obstacle(self, name: str) -> str:
         """Why a mode is not possible; empty if it is, as far as is known without a model."""
@@ -197,7 +199,7 @@ class ReplaySetup:
         rate = in_time.rate if in_time is not None and in_time.queue else None
         pace = 1.0 if in_time is None else in_time.rate
         cores = 1 if mode.cost * pace <= ONE_CORE else available()
-        return Bank(self.odometry, mode.sets, WARM_UP, self.config.lost_track, cores, rate)
+        return Bank(self.odometry, mode.sets, self.config.lost_track, cores, rate)
 
     def identity(self, name: str) -> dict[str, Any]:
         """What a mode depends on, as plain data."""
@@ -209,7 +211,7 @@ class ReplaySetup:
         if mode.bank:
             # A model's sets are known by their numbers.
             members = [*(mode.sets.values() if name == UNTRAINED else mode.sets)]
-            about["switching"] = {"mechanism": "bank", "warm_up": WARM_UP, "members": members}
+            about["switching"] = {"mechanism": "bank", "members": members}
         else:
             about["switching"] = {"mechanism": "live"} | self.odometry.steering
         if name != UNTRAINED:
@@ -293,14 +295,14 @@ class Replays:
         folder = self.study.folder / "replays" / name
         return next(folder.glob(f"*-{digest}"), folder / f"{mode}-{digest}")
 
-    def read(self, name: str, mode: str) -> StoredReplay:
+    def read(self, name: str, mode: str) -> Run:
         """Read a replay; a StoredReplayError says that it is missing or damaged."""
         folder = self.folder(name, mode)
         if not (folder / "replay.json").exists():
             why = self.changes(name, mode)
             what = f"{mode} was made from other inputs: {why}" if why else f"there is no {mode}"
             raise StoredReplayError(f"{folder.parent}: {what}; run `adaptune online` first")
-        return StoredReplay.read(folder)
+        return read_run(folder)
 
     def made(self, name: str) -> tuple[str, ...]:
         """The modes in which a sequence was replayed, see `in_order`."""
@@ -410,7 +412,7 @@ def replay_modes(
                     _replay(replays, name, mode, folder, progress)
                     made += 1
                 if number == 0 and not (reference_folder(study, name) / CONTRADICTIONS).exists():
-                    _judge(study, name, StoredReplay.read(folder).trajectory)
+                    _write_judged_reference(study, name, read_run(folder).trajectory)
     return made
 
 
@@ -418,7 +420,7 @@ def _in_vain(odometry: Factory, recording: Recording) -> str:
     """Why a ROS system cannot adapt live: it accepts parameters, and does not read them again."""
     if not isinstance(odometry, OdometryFactory) or odometry.name not in ROS_SYSTEMS:
         return ""
-    from adaptune.odometry.docker.probe import check_live  # little else needs it
+    from adaptune.odometry.systems.probe import check_live  # little else needs it
 
     try:
         check_live(odometry, recording)
@@ -427,7 +429,7 @@ def _in_vain(odometry: Factory, recording: Recording) -> str:
     return ""
 
 
-def _judge(study: Study, name: str, replayed: Trajectory) -> None:
+def _write_judged_reference(study: Study, name: str, replayed: Trajectory) -> None:
     """Write the reference of a sequence, and what scans say where a replay disagrees with it."""
     recording, sequences = study.sequences.open(name), study.sequences
     reference, wrong = recording.reference(), list[Finding]()
@@ -451,13 +453,13 @@ def _replay(replays: Replays, name: str, mode: Mode, folder: Path, progress: Pro
     release_memory()
     instance = partial(replays.setup.instance, mode, name)
     try:
-        record = replayed(study, recording, instance, mode, what, progress)
+        run = run_mode(study, recording, instance, mode, what, progress)
     except DescriptorError as error:
         raise AdaptuneError(f"sequences.{name}: {error}") from error
-    write_replay(folder, record, replays.inputs(name, mode.name))
+    write_run(folder, run, replays.inputs(name, mode.name))
 
 
-def replayed(
+def run_mode(
     study: Study,
     recording: Recording,
     instance: Callable[[], OdometryInstance],
@@ -465,28 +467,28 @@ def replayed(
     what: str,
     progress: Progress,
     again: bool = False,
-) -> ReplayRecord:
+) -> Run:
     """Replay; the baseline, with which all is compared, once more `again` where it had a fault."""
     online, make, n = study.config.online, mode.selector, recording.n_messages
 
-    def watch(record: ReplayRecord) -> None:
-        progress(what, record.done, n)
+    def watch(run: Run) -> None:
+        progress(what, run.done, n)
 
     with ExitStack() as stack:
         odometry = stack.enter_context(closing(instance()))
         given = recording, odometry, study.config.health
         if online.real_time is None:
             selector = make and make()
-            fixed = None if selector is None else selector.fall_back()
-            record = replay(*given, selector, online.period, watch, what, fixed)
+            fallback = None if selector is None else selector.fall_back()
+            run = replay(*given, selector, online.period, watch, what, fallback)
         else:
             process = make and stack.enter_context(closing(SelectorProcess(make, online.period)))
-            record = replay_in_real_time(*given, online.real_time, process, watch, what)
+            run = replay_in_real_time(*given, online.real_time, process, watch, what)
     progress(what, n, n)
-    if mode.name != BASELINE or not record.faults:
-        return record
-    wrong = f"{what}: a fault with the odometry's own parameters: {record.faults[-1]}"
+    if mode.name != BASELINE or not run.faults:
+        return run
+    wrong = f"{what}: a fault with the odometry's own parameters: {run.faults[-1]}"
     if again:
         raise AdaptuneError(f"{wrong}; mend the odometry, or leave the sequence out of the test")
     _log.warning("%s; so once more", wrong)
-    return replayed(study, recording, instance, mode, what, progress, again=True)
+    return run_mode(study, recording, instance, mode, what, progress, again=True)

@@ -12,9 +12,10 @@ from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.scan import Imu, Scan, joined, read_ahead
+from adaptune.runs.loop import AfterScan, Driver
+from adaptune.runs.record import Run
 from adaptune.selector import Periods
 from adaptune.study.config import RealTimeConfig
-from online.replay import Driver, ReplayRecord, Watch
 from online.selector_process import Answer, SelectorProcess
 
 _AHEAD = 32
@@ -77,31 +78,31 @@ def replay_in_real_time(
     health: HealthCheck,
     settings: RealTimeConfig,
     selector: SelectorProcess | None = None,
-    watch: Watch = lambda _: None,
+    watch: AfterScan = lambda _: None,
     what: str = "the replay",
     clock: Clock = CLOCK,
-) -> ReplayRecord:
+) -> Run:
     """Replay a recording at the sensor's rate.
 
     While the odometry prepares a scan, the selector's process describes it. A selection that is
-    late is dropped. The sensor goes by `clock`; for the rest see `online.replay.replay`.
+    late is dropped. The sensor goes by `clock`; for the rest see `adaptune.runs.loop.replay`.
     """
-    record = ReplayRecord(settings.rate)
-    drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
+    run = Run(settings.rate)
+    drive = RealTimeDrive(odometry, health, settings, selector, run, what, clock)
     source = read_ahead(scans, _AHEAD)
     first = list(islice(source, _AHEAD // 2))  # read before the first one is due
     every = chain(first, source)
     for arrival in arrivals(every, settings.rate, settings.queue, clock):
         drive.step(arrival)
-        watch(record)
+        watch(run)
     drive.finish()
-    return record.finish(odometry, 0.0 if selector is None else selector.cpu)
+    return run.finish(odometry, 0.0 if selector is None else selector.cpu)
 
 
 class RealTimeDrive:
     """Takes scans as they come, and applies what is selected in time.
 
-    `record` receives what becomes of each scan and each selection; for the rest see
+    `run` receives what becomes of each scan and each selection; for the rest see
     `replay_in_real_time`.
     """
 
@@ -111,38 +112,38 @@ class RealTimeDrive:
         health: HealthCheck,
         settings: RealTimeConfig,
         selector: SelectorProcess | None,
-        record: ReplayRecord,
+        run: Run,
         what: str,
         clock: Clock = CLOCK,
     ):
-        self.record, self._clock = record, clock
+        self.run, self._clock = run, clock
         self._odometry, self._selector = odometry, selector
         self._deadline = settings.deadline
         self._periods = Periods(1.0 if selector is None else selector.period * 1e9)
-        fixed = None if selector is None else selector.fixed
-        self._driver = Driver(odometry, health, fixed, what, record.note)
+        fallback = None if selector is None else selector.fallback
+        self._driver = Driver(odometry, health, fallback, what, run.note)
 
     def step(self, arrival: Arrival) -> RegisteredScan:
         """Select if that is due, and find the pose of a scan."""
         scan, due, dropped = arrival
-        self.record.begin()
-        self.record.dropped += dropped
+        self.run.begin()
+        self.run.dropped += dropped
         begin = self._clock.now()
         prepared = self._prepare(scan, due)
         step = self._driver.register(scan, prepared, self._clock.now() - begin)
-        self.record.late.append(self._clock.now() - due)
-        self.record.end(step)
+        self.run.late.append(self._clock.now() - due)
+        self.run.end(step)
         return step
 
     def finish(self) -> None:
         """Record what selector and bank have counted, and what was not confirmed."""
         self._driver.give_up()
         if self._selector is not None:
-            self.record.unseen = self._selector.unseen
+            self.run.unseen = self._selector.unseen
         if isinstance(self._odometry, Bank):
             late = self._odometry.late
-            self.record.late_members = int(late.scans.sum())
-            self.record.removed = int(late.removed.sum())
+            self.run.late_members = int(late.scans.sum())
+            self.run.removed = int(late.removed.sum())
 
     def _prepare(self, scan: Scan, due: float) -> Any:
         """Prepare a scan with the parameters that it is registered with.
@@ -160,7 +161,7 @@ class RealTimeDrive:
             return odometry.prepare(scan)
         begin = self._clock.now()
         answer = selector.answer_to(scan.stamp, 0.5 * self._left(due)) if shown else None
-        self.record.waited.append(self._clock.now() - begin)
+        self.run.waited.append(self._clock.now() - begin)
         if answer is not None:
             self._take(answer, scan.stamp, due)
             return odometry.prepare(scan)
@@ -172,7 +173,7 @@ class RealTimeDrive:
 
     def _take(self, answer: Answer | None, stamp: int, due: float) -> None:
         if answer is None or answer.selection is None:
-            self.record.missed += 1
+            self.run.missed += 1
         else:
             self._driver.take(stamp, answer.selection, self._clock.now() - due)
 

@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune._system.files import replacing_folder
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import nearest
-from adaptune.files import replacing_folder
 from adaptune.geometry import invert
-from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages
 from adaptune.recording.scan import Recording
 from adaptune.reference.judge import Reference
+from adaptune.runs.files import StoredReplayError
+from adaptune.runs.record import Run
 from adaptune.selector import Periods
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
-from online.live import Placed, RosMessages, placed
 from online.modes import Replays, sequences_without_model
-from online.record import StoredReplay, StoredReplayError
 from online.reference import read_reference
+from online.topics import Placed, RosMessages, placed
 
 CLOUD_PERIOD = 1.0
 """Seconds from one cloud to the next."""
@@ -36,17 +37,14 @@ ODOM, SENSOR = "odom", "sensor"
 _PLACING = ("adaptive", "untrained", "paper", "fixed")
 """Modes whose poses place the clouds, the first that was replayed."""
 _OF_SELECTIONS = {
-    "predicted_error": "predicted_error_percent",
-    "predicted_fixed_error": "predicted_fixed_percent",
-    "estimated_error": "estimated_error_percent",
-    "estimated_error_low": "estimated_low_percent",
-    "estimated_error_high": "estimated_high_percent",
-    "familiarity": "familiarity",
-    "selection_ms": "ms",
+    "predicted_error": "predicted_error",
+    "predicted_fixed_error": "predicted_fixed",
+    "estimated_error": "estimated_error",
+    "estimated_error_low": "estimated_low",
+    "estimated_error_high": "estimated_high",
+    "similarity": "similarity",
 }
-"""Topics of a mode by column of ``selections.csv``."""
-_TIMES = ("prepare_ms", "register_ms", "late_ms")
-"""Columns of ``frames.csv`` that are topics."""
+"""What a mode's topics have of its selections."""
 _PATH = "nav_msgs/msg/Path"
 
 
@@ -144,23 +142,27 @@ class _Composer:
         self.topics[name] = kind
         self.streams.append((name, stamp, message) for stamp, message in stamped)
 
-    def add_mode(self, mode: str, replay: StoredReplay, reference: Reference) -> None:
+    def add_mode(self, mode: str, replay: Run, reference: Reference) -> None:
         """Add what a mode selected, its errors and its times."""
         trajectory, made = replay.trajectory, replay.choice_stamps
         stamps, end = trajectory.stamps, trajectory.stamps[-1:]
-        for name, column in _OF_SELECTIONS.items():
-            self._numbers(topic(mode, name), made, replay.selections[column])
-        for name in _TIMES:
-            values = replay.frames[name]
-            self._numbers(topic(mode, name), stamps[: len(values)], values)
+        selections = [choice.selection for choice in replay.choices]
+        for name, of in _OF_SELECTIONS.items():
+            self._numbers(topic(mode, name), made, [getattr(one, of) for one in selections])
+        took = {"prepare": [s.prepare_seconds for s in replay.steps], "late": replay.late}
+        took |= {"register": [step.register_seconds for step in replay.steps]}
+        took |= {"selection": [choice.seconds for choice in replay.choices]}
+        for name, seconds in took.items():
+            at = made if name == "selection" else stamps
+            self._numbers(topic(mode, f"{name}_ms"), at[: len(seconds)], 1e3 * np.array(seconds))
         # The one looks ahead, as predictions do, the other back, as estimates do.
         self._numbers(topic(mode, "true_error"), stamps, reference.errors(trajectory))
         self._numbers(topic(mode, "true_error_behind"), stamps, reference.errors_behind(trajectory))
         self._numbers(topic(mode, "restarted"), stamps, replay.restarted)
-        self._numbers(topic(mode, "lost"), made, replay.lost, end)
+        self._numbers(topic(mode, "lost"), made, [one.lost for one in selections], end)
         for trial, weights in replay.weights.items():
             self._numbers(topic(mode, "weights", str(trial)), made, weights, end)
-        for name, chosen in replay.choices.items():
+        for name, chosen in replay.values.items():
             if any(isinstance(value, str) for value in chosen):
                 texts = list(map(str, chosen))
                 self._add_data(topic(mode, "parameters", name), "std_msgs/msg/String", made, texts)

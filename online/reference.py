@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import manifest
-from adaptune.files import write_text
+from adaptune._system import manifest
+from adaptune._system.files import write_text
 from adaptune.reference.judge import Reference
+from adaptune.runs.files import StoredReplayError
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
-from online.record import StoredReplayError
 
 CONTRADICTIONS = "contradictions.txt"
 """Written last: what scans say against a reference."""
@@ -69,7 +69,7 @@ def read_reference(study: Study, name: str) -> Reference:
         # Frames in a gap, and across a jump, have no label in training, and get none here.
         known = study.sequences.open(name).reference()
         gap = trajectory.max_gap if known is None else known.max_gap
-        # Nor have those of a stretch that is left out, which is longer than this.
+        # Nor have those of a segment that is left out, which is longer than this.
         steps = np.diff(trajectory.stamps) * 1e-9
         rare = 3.0 * float(np.median(steps)) if len(steps) else 0.0
         trajectory = replace(trajectory, max_gap=min(gap, max(1.9, rare)))

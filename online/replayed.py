@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +12,20 @@ from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
 from adaptune.reference.judge import Reference
 from adaptune.report.charts import Spans
+from adaptune.runs.record import Run
 from adaptune.space import ParameterSpace, in_words
 from adaptune.study.driven import named
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, read_tum
 from online.modes import BASELINE, FIXED, UNTRAINED, Replays
-from online.record import StoredReplay
 from online.reference import read_reference
 
 
 def scene_spans(
     legs: Sequence[tuple[str, float]], driven: Trajectory, stamps: NDArray[np.int64]
 ) -> Spans:
-    """The scenes of a drive, as stretches of its time.
+    """The scenes of a drive, as segments of its time.
 
     `legs` are the name and metres of each scene, in driving order. These become time by the true
     poses that were `driven`: their path is a little longer than the road, because the vehicle
@@ -45,32 +45,38 @@ def scene_spans(
     return Spans(kept, tuple(names[i] for i in shown))
 
 
-class ModeReplay(NamedTuple):
-    """Errors and selections of one mode along a sequence: n scans, m selections."""
+@dataclass(frozen=True, eq=False)
+class JudgedRun:
+    """A replay in one mode, and its errors: n scans, m selections."""
 
-    seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
+    run: Run
     errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
     errors_around: NDArray[np.float64]  # the mean of those through each place
     errors_behind: NDArray[np.float64]  # the mean of those that ended in the last 30 s
-    restarted: NDArray[np.bool_]  # of shape (n,)
-    choice_seconds: NDArray[np.float64]  # of shape (m,)
-    choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
-    weights: Mapping[str, Sequence[float]]  # in a bank by member instead, of shape (m,)
-    # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
-    # interval; NaN where there is none.
-    estimated: NDArray[np.float64]
-    states: NDArray[np.str_]  # of shape (m,), see `Selection`
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
+    weights: Mapping[str, Sequence[float]]  # in a bank by the name of a member, of shape (m,)
+    members: Mapping[str, Sequence[str]]  # what each did, see `Motions`, of shape (n,)
+
+    @cached_property
+    def seconds(self) -> NDArray[np.float64]:
+        """Since the first scan, of shape (n,)."""
+        return self.run.trajectory.seconds
 
     @property
     def span(self) -> NDArray[np.float64]:
         """When each choice was made, and the end, until which the last one holds."""
-        return np.append(self.choice_seconds, self.seconds[-1])
+        made = (self.run.choice_stamps - self.run.steps[0].stamp) * 1e-9
+        return np.append(made, self.seconds[-1])
+
+    @property
+    def states(self) -> NDArray[np.str_]:
+        """The state of each selection, of shape (m,), see `Selection`."""
+        return np.array([choice.selection.state for choice in self.run.choices])
 
     @property
     def adapts(self) -> bool:
         """Whether anything was selected along the way."""
-        return len(self.choice_seconds) > 1
+        return len(self.run.choices) > 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +85,7 @@ class ReplayedSequence:
 
     name: str
     length: float  # metres of a sub-trajectory
-    modes: Mapping[str, ModeReplay]  # in the order in which lines lie on each other
+    modes: Mapping[str, JudgedRun]  # in the order in which lines lie on each other
     space: ParameterSpace
     scenes: Spans | None = None  # of a simulated course
     estimated: bool = False  # whether the reference was computed from the recording
@@ -98,7 +104,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     if not read:
         return ReplayedSequence(name, length, {}, space)
     reference = read_reference(study, name)
-    modes = {mode: _read_mode(mode, replay, reference, model) for mode, replay in read.items()}
+    modes = {mode: _judged(mode, run, reference, model) for mode, run in read.items()}
     scenes = scenes_along(study.sequences, name, next(iter(read.values())).trajectory.stamps)
     members = {
         _member(mode, model, number): in_words(model.sets[number])
@@ -118,27 +124,22 @@ def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]
     return scene_spans(course.legs, read_tum(path), stamps) if path.exists() else None
 
 
-def _read_mode(
-    mode: str, replay: StoredReplay, reference: Reference, model: ErrorModel | None
-) -> ModeReplay:
-    """Read a replay; `model` names the members of a bank."""
-    stamps, truth = replay.trajectory.stamps, reference.trajectory
-    places = _seen_from(replay.trajectory)
+def _judged(mode: str, run: Run, reference: Reference, model: ErrorModel | None) -> JudgedRun:
+    """Judge a replay; `model` names the members of a bank."""
+    odometry, truth = run.trajectory, reference.trajectory
+    stamps, places = odometry.stamps, _seen_from(odometry)
     if truth is not None and len(known := np.flatnonzero(np.isin(stamps, truth.stamps))):
         places = np.full((len(stamps), 2), np.nan)
         places[known] = _seen_from(truth)[np.searchsorted(truth.stamps, stamps[known])]
-    return ModeReplay(
-        (stamps - stamps[0]) * 1e-9,
-        reference.errors(replay.trajectory),
-        reference.errors_around(replay.trajectory),
-        reference.errors_behind(replay.trajectory),
-        replay.restarted,
-        np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
-        replay.choices,
-        {_member(mode, model, number): weights for number, weights in replay.weights.items()},
-        replay.estimated,
-        replay.states,
+    names = {number: _member(mode, model, number) for number in run.weights}
+    return JudgedRun(
+        run,
+        reference.errors(odometry),
+        reference.errors_around(odometry),
+        reference.errors_behind(odometry),
         places,
+        {names[number]: weights for number, weights in run.weights.items()},
+        {names[n]: [step.states.get(n, "") for step in run.steps] for n in names},
     )
 
 

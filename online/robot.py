@@ -8,7 +8,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from adaptune.errors import AdaptuneError, nearest
 from adaptune.geometry import invert
@@ -18,31 +17,24 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.timing import Timing
 from adaptune.ros.link import RosLink
+from adaptune.runs.files import DriveLog
+from adaptune.runs.loop import AfterScan
+from adaptune.runs.record import Choice, Run
 from adaptune.selector import Selector
 from adaptune.study.config import RealTimeConfig, RosConfig, StudyConfig
 from adaptune.study.driven import ModeError
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
-from online.live import KEPT, ODOMETRY, LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive
-from online.record import DriveLog
-from online.replay import Choice, ReplayRecord, Watch
 from online.selector_process import SelectorProcess
 from online.steered import SteeredNode
+from online.topics import MAX_KEPT, ODOMETRY_TYPE, RosMessages, TopicScans, Uncertainty, placed
 
 SELECTION_TOPIC = "adaptune/selection"
 _BEGIN = 6.0  # seconds in which a node that is not there is known to be missing
 
 _log = logging.getLogger(__name__)
-
-
-class DriveRecord(NamedTuple):
-    """What became of a drive."""
-
-    folder: Path  # of its trajectory, selections and scans
-    scans: int
-    record: ReplayRecord  # of its last part, where the clock went back
 
 
 class RobotDrive:
@@ -58,6 +50,8 @@ class RobotDrive:
         If the mode, the model and the study do not go together.
     """
 
+    folder: Path  # of its trajectory, selections and scans; of the last part
+
     def __init__(self, study: Study, mode: str | None, model_path: Path | None):
         config = study.config
         real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
@@ -70,7 +64,8 @@ class RobotDrive:
         self._ros = config.online.ros
         self._like = _like(config, study.sequences)
         self._points = _named(self._ros.points or self._like.points, "online.ros.points")
-        self._scans: LiveScans | None = None
+        self.done = 0  # scans of all parts before
+        self._scans: TopicScans | None = None
         self._stopped = False
         if model_path is not None:
             setup.check(model_path)
@@ -104,9 +99,8 @@ class RobotDrive:
         """What it drives."""
         return self._mode.name
 
-    def run(self, link: RosLink, watch: Watch = lambda _: None) -> DriveRecord:
+    def run(self, link: RosLink, watch: AfterScan = lambda _: None) -> Run:
         """Drive until Ctrl-C or `stop`; where the clock goes back, all begins anew."""
-        done = 0
         with ExitStack() as stack:
             steer, make = self._ros.steer, self._mode.selector
             steered = None if steer is None else SteeredNode(link, steer, self._points)
@@ -115,13 +109,13 @@ class RobotDrive:
                 stack.enter_context(closing(selector))
             self._scans = scans = self._topics(link)
             publisher = _Publisher(link, self._ros, self._study.config.sub_trajectory, scans)
-            driven = None
-            while driven is None or not (scans.stopped or self._stopped):
+            run = None
+            while run is None or not (scans.stopped or self._stopped):
                 odometry = steered or self._setup.instance(self._mode)
                 with closing(odometry):
-                    driven = self._part(odometry, selector, publisher, watch, done)
-                done = driven.scans
-        return driven
+                    run = self._part(odometry, selector, publisher, watch)
+                self.done += run.done
+        return run
 
     def stop(self) -> None:
         """End the drive; any thread may call it."""
@@ -129,66 +123,66 @@ class RobotDrive:
         if self._scans is not None:
             self._scans.stop()
 
-    def _topics(self, link: RosLink) -> LiveScans:
+    def _topics(self, link: RosLink) -> TopicScans:
         """Subscribe to scans, and to an IMU if the odometry needs one."""
         like, imu = self._like, None
         timing = Timing(like.stamp, like.time_unit, like.period)
         if self._study.odometry.description.needs_imu and self._ros.steer is None:
             imu = like.imu or ImuConfig()
             imu = imu.model_copy(update={"topic": _named(imu.topic, "imu.topic")})
-        return LiveScans(link, self._points, timing, self._settings.queue, imu)
+        return TopicScans(link, self._points, timing, self._settings.queue, imu)
 
     def _part(
         self,
         odometry: OdometryInstance,
         selector: SelectorProcess | None,
         publisher: "_Publisher",
-        watch: Watch,
-        done: int,
-    ) -> DriveRecord:
-        """Drive until the clock goes back; so many scans were there before."""
+        watch: AfterScan,
+    ) -> Run:
+        """Drive until the clock goes back."""
         assert self._scans is not None
-        folder, names = _new_folder(self._study.folder / "drives"), self._study.odometry.space.names
+        names, goes_on = list(self._study.odometry.space.names), self.done > 0
+        self.folder = _new_folder(self._study.folder / "drives")
         # A robot that drives goes on, whatever happens to its disk.
-        with closing(DriveLog(folder, list(names), goes_on=done > 0)) as log:
+        with closing(DriveLog(self.folder, names, goes_on=goes_on)) as log:
             publisher.begin(log)
             try:
                 if selector is not None:
-                    odometry.apply(selector.fixed)
+                    odometry.apply(selector.fallback)
                     # One that is there, but busy, takes it when it can.
-                    odometry.confirmed(0.0 if done else _BEGIN)
+                    odometry.confirmed(0.0 if goes_on else _BEGIN)
             except AdaptuneError as error:
-                if not done:
+                if not goes_on:
                     raise
                 _log.warning("the fixed set cannot be applied: %s", error)
-            record = ReplayRecord(1.0, publisher.choice)
+            run = Run(1.0, publisher.choice)
             for name in ("steps", "choices", "rejected", "late", "waited"):
-                setattr(record, name, deque(maxlen=KEPT))
+                setattr(run, name, deque(maxlen=MAX_KEPT))
             health = self._study.config.health
-            drive = RealTimeDrive(odometry, health, self._settings, selector, record, "drive")
+            drive = RealTimeDrive(odometry, health, self._settings, selector, run, "drive")
             if self._stopped:
                 self._scans.stop()
             try:
                 for arrival in self._scans.arrivals():
-                    publisher.step(drive.step(arrival), record.late[-1])
-                    watch(record)
+                    publisher.step(drive.step(arrival), run.late[-1])
+                    watch(run)
             except KeyboardInterrupt:
                 self._scans.stop()
             drive.finish()
-            return DriveRecord(folder, done + record.done, record)
+            return run
 
 
 class _Publisher:
     """Publishes and records what a drive finds."""
 
-    def __init__(self, link: RosLink, ros: RosConfig, length: float, scans: LiveScans):
+    def __init__(self, link: RosLink, ros: RosConfig, length: float, scans: TopicScans):
         self._scans = scans
         self._messages = RosMessages(link.store, ros.frame)
         self._length = length
         self._selection = link.advertise(SELECTION_TOPIC, "std_msgs/msg/String")
         # A node that is steered publishes its own poses.
         own = ros.steer is None
-        self._odometry = link.advertise(ros.odometry, ODOMETRY) if own else None
+        self._odometry = link.advertise(ros.odometry, ODOMETRY_TYPE) if own else None
         tf = own and ros.tf
         self._tf = link.advertise("/tf", "tf2_msgs/msg/TFMessage") if tf else None
 

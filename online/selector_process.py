@@ -11,9 +11,9 @@ from multiprocessing.connection import Connection
 from queue import Queue
 from typing import Any, NamedTuple
 
+from adaptune._system.forking import fork_server
+from adaptune._system.machine import shared_cores
 from adaptune.errors import AdaptuneError
-from adaptune.forking import fork_server
-from adaptune.machine import shared_cores
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.selector import BACK, AnySelector, TimedSelector
@@ -76,7 +76,7 @@ class SelectorProcess:
         if isinstance(started, str):
             self.close()
             raise AdaptuneError(f"the selector's process: {started}")
-        self.fixed = started  # what the selector falls back to
+        self.fallback = started  # what the selector falls back to
 
     def show(self, stamp: int, scan: Scan, motions: Motions, seconds: float = 0.0) -> bool:
         """Show a scan, see `TimedSelector.update`; whether the process gets it.

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from adaptune.metrics import cap
 from adaptune.paired import Interval, Pair, Ratio, in_cell, interval_of_mean, ratio
 from adaptune.reference.judge import Reference, StandardErrors, columns_of
+from adaptune.runs.record import NO_RUN, Run, RunSummary, switched
 from adaptune.trajectory import Trajectory
-from online.record import StoredReplay, switched
 
 ALL = "all"
 """In place of a sequence, all of them."""
@@ -31,28 +31,20 @@ class ComparisonRow:
     # Mean sub-trajectory RTE in percent; None where the reference is unknown.
     rte: float | None = None
     ratio: float | None = None  # to that of the yardstick
-    restarts: int = 0  # by the health check
+    run: RunSummary = NO_RUN  # what was measured on the way; means, and sums of counts, over all
     switches: int = 0  # changes of the parameters
-    poor_scans: int = 0  # too poor to register
     rte_interval: Interval = None
     ratio_interval: Interval = None
     blocks: int | None = None  # sub-trajectories that follow each other: what intervals rest on
     standard: StandardErrors | None = None
     first_restart: float | None = None  # seconds from the start
-    unhealthy: tuple[str, ...] = ()  # what the health check found
     yardstick: str = "fixed"  # the mode that others are compared with
     # Percent: the mean of the odometry's own error, measured while driving and without reference.
     estimated: float | None = None
     estimated_interval: Interval = None
-    lost_seconds: float = 0.0  # how long the bank was lost
     reference: str = "given"  # `given`, `estimated` or `none`
     reference_error: float | None = None  # percent, of an estimated one
-    cpu_ms: float | None = None  # milliseconds of CPU time a scan
-    memory_mb: float | None = None  # most megabytes of all processes
-    real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
-    first_pose: float = 0.0  # seconds from the first scan
-    fault: str = ""  # the last one of the odometry
-    # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
+    # Over all sequences: geometric mean of the ratios over the worst tenth of the segments, and on
     # how many sequences the mode has less and more error by what counts.
     worst_tenth: float | None = None
     better: int | None = None
@@ -62,12 +54,12 @@ class ComparisonRow:
 
     def columns(self) -> dict[str, Any]:
         """The row of a table in a file: all that is known, ends of intervals as numbers."""
-        more: dict[str, Any] = {n: getattr(self, n) for n in ("reference_error", "poor_scans")}
+        more: dict[str, Any] = {"reference_error": self.reference_error}
         for name in ("rte", "ratio", "estimated"):
             ends = getattr(self, f"{name}_interval")
             more[f"{name}_low"], more[f"{name}_high"] = ends or (None, None)
         more |= {n: getattr(self, n) for n in ("worst_tenth", "better", "worse")}
-        more |= self._standard() | dict(self.real_time or {})
+        more |= self._standard() | (self.run.real_time or {})
         shown = {key: value for key, value in self._shown().items() if key != "95 %"}
         return {"sequence": self.sequence, **shown, "blocks": self.blocks} | more
 
@@ -79,11 +71,11 @@ class ComparisonRow:
             f"vs {self.yardstick}": self.ratio,
             "95 %": None if itself else in_cell(self.ratio_interval),
             "estimated [%]": self.estimated,
-            "lost [s]": self.lost_seconds,
-            "restarts": self.restarts,
+            "lost [s]": self.run.lost_seconds,
+            "restarts": self.run.restarts,
             "switches": self.switches,
-            "cost [ms]": self.cpu_ms,
-            "memory [MB]": self.memory_mb,
+            "cost [ms]": self.run.cpu_ms,
+            "memory [MB]": self.run.memory_mb,
             "reference": self.reference,
         }
 
@@ -113,8 +105,8 @@ class ComparisonRow:
             "better / worse": None if self.better is None else f"{self.better} / {self.worse}",
         }
         changed = {
-            "lost [s]": self.lost_seconds or None,
-            "restarts": self.restarts if driven else None,
+            "lost [s]": self.run.lost_seconds or None,
+            "restarts": self.run.restarts if driven else None,
             "switches": self.switches if driven else None,
             "reference": None if self.reference == "given" else self.reference,
         }
@@ -139,9 +131,7 @@ class JudgedModes(NamedTuple):
         return Pair(both[:, known], self.block, self.recording or self.name, own)
 
 
-def compare_modes(
-    name: str, replays: Mapping[str, StoredReplay], reference: Reference
-) -> JudgedModes:
+def compare_modes(name: str, replays: Mapping[str, Run], reference: Reference) -> JudgedModes:
     """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`.
 
     Errors are those at the scans that no replay has dropped.
@@ -160,29 +150,20 @@ def compare_modes(
     return judged._replace(rows=[_with_errors(row, judged) for row in rows])
 
 
-def _measured(row: ComparisonRow, replay: StoredReplay, reference: Reference) -> ComparisonRow:
+def _measured(row: ComparisonRow, replay: Run, reference: Reference) -> ComparisonRow:
     """Fill in what was measured while driving."""
     kind = "estimated" if reference.estimated else "given"
-    summary, odometry = replay.summary, replay.trajectory
-    restarts = (odometry.stamps[replay.restarted] - odometry.stamps[0]) * 1e-9
+    restarts = replay.trajectory.seconds[replay.restarted]
     estimated, interval = _estimated(replay.estimated)
     return replace(
         row,
-        restarts=summary.restarts,
-        switches=int(switched(replay.choices).sum()),
-        poor_scans=summary.poor_scans,
+        run=replay.summary,
+        switches=int(switched(replay.values).sum()),
         first_restart=float(restarts[0]) if len(restarts) else None,
-        unhealthy=tuple(summary.unhealthy),
         estimated=estimated,
         estimated_interval=interval,
-        lost_seconds=summary.lost_seconds,
         reference="none" if reference.trajectory is None else kind,
         reference_error=reference.error,
-        cpu_ms=summary.cpu_ms,
-        memory_mb=summary.memory_mb,
-        real_time=summary.real_time,
-        first_pose=summary.first_pose,
-        fault=summary.fault,
     )
 
 

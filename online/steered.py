@@ -15,7 +15,7 @@ from adaptune.ros.link import BusyError, RosLink
 from adaptune.ros.steering import Steering
 from adaptune.space import ParameterSet, Selection
 from adaptune.study.config import SteerConfig
-from online.live import LivePoses
+from online.topics import TopicPoses
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class SteeredNode(OdometryInstance):
         T_base_sensor = np.eye(4) if settings.extrinsic is None else to_pose(settings.extrinsic)
         late = f"online.ros.steer.patience ({settings.patience:g} s) allows: raise it, or let less"
         late += " run on this machine"
-        self._poses = LivePoses(link, settings.odometry, T_base_sensor, points, late)
+        self._poses = TopicPoses(link, settings.odometry, T_base_sensor, points, late)
         self._begun: tuple[int, Poses] | None = None
         self._T_odom_node: Poses | None = None
         self._steering = Steering(

@@ -76,15 +76,15 @@ def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
         f"enough; with fewer than {MIN_RECORDINGS} test recordings, they speak of these alone.",
         f"vs {yardstick}: geometric mean of the ratios to the {YARDSTICKS[yardstick]}'s RTE."
         * (rows[-1].sequence == ALL),
-        "Worst tenth: that mean over the worst tenth of the stretches." * ("worst tenth" in shown),
+        "Worst tenth: that mean over the worst tenth of the segments." * ("worst tenth" in shown),
         "Better / worse: sequences on which the error is less or more by 1 %."
         * ("better / worse" in shown),
         "The oracle knows the errors: the best set of each sequence."
         * any(row.mode == ORACLE for row in rows),
         "Estimated: by the odometry itself while driving, without the reference."
         * any(row.estimated is not None for row in rows),
-        f"The error of an estimated reference pulls ratios towards 1, or hides what a mode has in "
-        f"common with it; intervals allow for {ERROR_FACTOR:g} times its estimate."
+        f"An estimated reference is wrong itself, by about as much as is told, which pulls ratios "
+        f"towards 1; intervals allow for {ERROR_FACTOR:g} times that."
         * any(row.reference == "estimated" for row in rows),
     ]
     return " ".join(filter(None, said))

@@ -12,16 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import manifest
+from adaptune._system import manifest
+from adaptune._system.files import write_text
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.tracker import Tracker
 from adaptune.paired import Pair, Ratio, along, joined, pooled
-from adaptune.progress import Progress, unseen
+from adaptune.runs.record import RunSummary, machine
 from adaptune.study.study import Study
-from online.modes import Mode, replayed
-from online.record import ReplaySummary, kept_up, machine
+from online.modes import Mode, run_mode
 
 COST, P99 = "cost", "pose, 99th percentile"
 """Milliseconds: of CPU time a scan; in real time, within which 99 % of the poses are there."""
@@ -33,13 +33,13 @@ _BLOCK, _PARTS = 10, 4
 """Scans whose costs count as one, and parts of a recording in each of which turns are compared."""
 
 
-class Driven(NamedTuple):
+class StoredReplay(NamedTuple):
     """A side as it was replayed on a recording."""
 
     study: Study
     name: str  # of the recording
     folder: Path  # of the replay
-    summary: ReplaySummary
+    summary: RunSummary
 
     @property
     def made(self) -> float:
@@ -66,11 +66,12 @@ class Driven(NamedTuple):
         recording, what = self.study.sequences.open(self.name), f"cost of {self.study.name}"
         mode = Mode(COST, {0: self.summary.inputs["parameters"]})
         given = self.study, recording, self.odometry, mode, f"{self.name}, {what}", show
-        kept = kept_up(record := replayed(*given))
-        return {COST: record.cpu_ms} | ({} if kept is None else {P99: kept["pose_ms_p99"]})
+        run = run_mode(*given)
+        kept = run.summary.real_time
+        return {COST: run.cpu_ms} | ({} if kept is None else {P99: kept["pose_ms_p99"]})
 
 
-def by_turns(both: Sequence[Driven], folder: Path, show: Progress) -> Costs:
+def by_turns(both: Sequence[StoredReplay], folder: Path, show: Progress) -> Costs:
     """What both sides cost, the new one first; `folder` keeps it.
 
     They take turns at each scan, and so meet the same state of the machine. Programs that run whole
@@ -97,7 +98,7 @@ def by_turns(both: Sequence[Driven], folder: Path, show: Progress) -> Costs:
 
 
 def _scan_by_scan(
-    both: Sequence[Driven], turn: int, show: Progress, first: int | None = None
+    both: Sequence[StoredReplay], turn: int, show: Progress, first: int | None = None
 ) -> list[list[float]]:
     """Drive both sides at the same time; milliseconds of each scan, by side."""
     # With the IMU, if one needs it: what is read anew is read as the same.

@@ -113,7 +113,7 @@ _ALONE = {BASELINE: may.OWN, FIXED: may.WITHIN, ADAPTIVE: ADAPTIVE, UNTRAINED: m
 
 
 def _driven(row: ComparisonRow) -> dict[str, Any]:
-    return {"mode": row.mode, _ON: "test", ERROR: row.rte, COST: row.cpu_ms}
+    return {"mode": row.mode, _ON: "test", ERROR: row.rte, COST: row.run.cpu_ms}
 
 
 def verdict(
@@ -170,7 +170,7 @@ def verdict(
 
 
 def _error_and_cost(row: ComparisonRow) -> str:
-    return f"{row.rte:.3f} %" + (f" at {row.cpu_ms:.1f} ms a scan" if row.cpu_ms else "")
+    return f"{row.rte:.3f} %" + (f" at {row.run.cpu_ms:.1f} ms a scan" if row.run.cpu_ms else "")
 
 
 def _gained(
@@ -182,8 +182,8 @@ def _gained(
 ) -> list[str]:
     """What is advised gives instead of the baseline, here and on another drive."""
     said = f"{best.rte:.3f} % instead of {base.rte:.3f} % with {whose}"
-    if best.cpu_ms and base.cpu_ms:
-        said += f", for {best.cpu_ms:.1f} instead of {base.cpu_ms:.1f} ms a scan"
+    if best.run.cpu_ms and base.run.cpu_ms:
+        said += f", for {best.run.cpu_ms:.1f} instead of {base.run.cpu_ms:.1f} ms a scan"
     ratio = _to_baseline(best)
     sure = f"That is {ratio.value:.2f} times the error ({_interval(ratio)}; {where})"
     if own is not None and own["low"] is not None:
@@ -210,12 +210,13 @@ def _why_kept(
 
 def _to_yardstick(row: ComparisonRow, last: Mapping[str, ComparisonRow], whose: str = "") -> str:
     """Error and CPU time of a mode, in times those of the fixed set, or the baseline."""
-    whose, other = whose or f"the {YARDSTICKS[row.yardstick]}'s", last[row.yardstick].cpu_ms
+    whose, other = whose or f"the {YARDSTICKS[row.yardstick]}'s", last[row.yardstick].run.cpu_ms
     ratio = _ratio(row)
     said = f"{ratio.value:.2f} times {whose} error ({_interval(ratio)})"
     if ratio.interval and ratio.interval[1] - ratio.interval[0] < ROUNDING:
         said = f"exactly {whose} error, as it drove the same set"
-    times = f", for {row.cpu_ms / other:.1f} times the CPU time" if row.cpu_ms and other else ""
+    own = row.run.cpu_ms
+    times = f", for {own / other:.1f} times the CPU time" if own and other else ""
     return said + times
 
 
@@ -224,13 +225,14 @@ ROUNDING = 1e-6
 
 
 def late(rows: Sequence[ComparisonRow], mode: str, periods: Mapping[str, float]) -> list[str]:
-    """Where a mode takes longer than the milliseconds from scan to scan, in a sentence."""
-    for row in rows:
+    """Where a mode was too late, or takes longer than the milliseconds between scans."""
+    of_mode = [row for row in rows if row.mode == mode]
+    for row in of_mode:
         period = periods.get(row.sequence, math.inf)
-        if row.mode == mode and row.cpu_ms is not None and row.cpu_ms > period:
+        if row.run.cpu_ms is not None and row.run.cpu_ms > period:
             every = f"On {row.sequence}, scans come every {period:.0f} ms"
-            return [f"{every}: {row.cpu_ms:.0f} ms of CPU time a scan take several cores."]
-    return []
+            return [f"{every}: {row.run.cpu_ms:.0f} ms of CPU time a scan take several cores."]
+    return [told for row in of_mode if (told := _too_late(row))][:1]
 
 
 def _where(rows: Sequence[ComparisonRow]) -> str:
@@ -258,7 +260,7 @@ def _ratio(row: ComparisonRow) -> Ratio:
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """How what adapts compares with controls, and what must be known to trust it."""
-    of_drives = _kept_up(rows) + _late(rows) + _restarts(rows)
+    of_drives = _kept_up(rows) + _first_poses(rows) + _restarts(rows)
     return _controls(rows) + _judges(rows) + _estimates(rows) + of_drives
 
 
@@ -267,11 +269,11 @@ def _controls(rows: Sequence[ComparisonRow]) -> list[str]:
     main = next(iter(_adapting(_judged(rows))), None)
     if main is None or EVEN not in main.against:
         return []
-    ratio, cost = main.against[EVEN], {row.mode: row.cpu_ms for row in last_rows(rows)}[EVEN]
+    ratio, cost = main.against[EVEN], {row.mode: row.run.cpu_ms for row in last_rows(rows)}[EVEN]
     has = f"`{main.mode}` has {ratio.value:.2f} times the error of the same bank with even weights"
     has += f" ({_interval(ratio)})"
-    if main.cpu_ms is not None and cost is not None:
-        has += f", at {main.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
+    if main.run.cpu_ms is not None and cost is not None:
+        has += f", at {main.run.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
     if ratio.interval is not None and ratio.interval[1] >= 1.0:
         has += ": what it gains is the mean of several sets; weighing them gains nothing sure"
     return [f"{has}."]
@@ -321,24 +323,33 @@ def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
     return said
 
 
+def _too_late(row: ComparisonRow) -> str:
+    """Of a replay in real time what came too late, in a sentence; empty if nothing did."""
+    if (kept := row.run.real_time) is None:
+        return ""
+    found = [
+        f"{kept[key]:.0f} {what}{'' if kept[key] == 1 else 's'}"
+        for key, what in (("dropped_scans", "scan"), ("missed_selections", "selection"))
+        if kept[key]
+    ]
+    if kept.get("removed_members"):
+        found.append(f"{kept['removed_members']:.0f} of its members, which it went on without")
+    if not found:
+        return ""
+    return (
+        f"On {row.sequence} `{row.mode}` was too late for {' and '.join(found)}, at "
+        f"{kept['rate']:g} times the recorded rate; 99 % of its poses came within "
+        f"{kept['pose_ms_p99']:.0f} ms of the scans."
+    )
+
+
 def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
-    """Of replays in real time, a sentence about each that did not get all scans or selections."""
-    said, timed = [], [(row, row.real_time) for row in rows if row.real_time is not None]
-    for row, kept in timed:
-        found = [
-            f"{kept[key]:.0f} {what}{'' if kept[key] == 1 else 's'}"
-            for key, what in (("dropped_scans", "scan"), ("missed_selections", "selection"))
-            if kept[key]
-        ]
-        if found:
-            said.append(
-                f"On {row.sequence} `{row.mode}` was too late for {' and '.join(found)}, at "
-                f"{kept['rate']:g} times the recorded rate; 99 % of its poses came within "
-                f"{kept['pose_ms_p99']:.0f} ms of the scans."
-            )
-    if timed and not said:
-        rate = timed[0][1]["rate"]
-        ms = max(kept["pose_ms_p99"] for _, kept in timed)
+    """Of replays in real time, what came too late."""
+    said = [told for row in rows if (told := _too_late(row))]
+    kept_up = [kept for row in rows if (kept := row.run.real_time) is not None]
+    if kept_up and not said:
+        rate = kept_up[0]["rate"]
+        ms = max(kept["pose_ms_p99"] for kept in kept_up)
         within = f"99 % of the poses came within {ms:.0f} ms of their scans, in every mode"
         said.append(
             f"Replayed at {rate:g} times the recorded rate, nothing came too late: {within}."
@@ -346,11 +357,11 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
     return said
 
 
-def _late(rows: Sequence[ComparisonRow]) -> list[str]:
+def _first_poses(rows: Sequence[ComparisonRow]) -> list[str]:
     late: dict[str, list[float]] = {}
     for row in rows:
-        if row.first_pose:
-            late.setdefault(row.sequence, []).append(row.first_pose)
+        if row.run.first_pose:
+            late.setdefault(row.sequence, []).append(row.run.first_pose)
     return [
         f"On {name} the odometry gave its first pose after {max(seconds):.1f} s; errors count from "
         f"there."
@@ -366,8 +377,8 @@ def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
         for row in mine:
             if row.first_restart is not None:
                 at = f"at {row.first_restart:.1f} s"
-                when = at if row.restarts == 1 else f"{row.restarts} times, first {at}"
-                modes.setdefault(f"{when} ({', '.join(row.unhealthy)})", []).append(row.mode)
+                when = at if row.run.restarts == 1 else f"{row.run.restarts} times, first {at}"
+                modes.setdefault(f"{when} ({', '.join(row.run.unhealthy)})", []).append(row.mode)
         each = (
             f"{'all modes' if len(those) == len(mine) else ', '.join(those)} {what}"
             for what, those in modes.items()

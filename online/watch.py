@@ -19,7 +19,7 @@ from adaptune.recording.timing import Timing
 from adaptune.ros.link import RosLink
 from adaptune.selector import Periods
 from adaptune.space import State
-from online.live import LivePoses, LiveScans, RosMessages
+from online.topics import RosMessages, TopicPoses, TopicScans
 
 WINDOW = 15.0
 """Seconds over which the error is told, or 30 m: a drift is to be seen soon."""
@@ -100,8 +100,8 @@ def watch_topics(
     publish = link.advertise(DIAGNOSTICS, "diagnostic_msgs/msg/DiagnosticArray")
     messages = RosMessages(link.store, "odom")
     late = f"{PATIENCE:g} s after their scans, and are not used: let less run on this machine"
-    poses = LivePoses(link, odometry, T_base_sensor, points, late)
-    scans = LiveScans(link, points, Timing(), WAITING)
+    poses = TopicPoses(link, odometry, T_base_sensor, points, late)
+    scans = TopicScans(link, points, Timing(), WAITING)
     while not scans.stopped:
         watch = Watch(length)
         for scan, came, _ in scans.arrivals():
@@ -121,7 +121,7 @@ def _shown(told: Told) -> tuple[int, str, dict[str, str]]:
 
 def write_told(path: Path, told: Iterable[Told]) -> None:
     """Write what was told as CSV."""
-    from adaptune.files import replacing
+    from adaptune._system.files import replacing
 
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         rows = ((f"{x:.3f}" if isinstance(x, float) else x for x in one) for one in told)

@@ -8,9 +8,9 @@ import pytest
 from needs import module_of
 from setups import failure
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.geometry import invert
-from adaptune.odometry.docker import rustle
+from adaptune.odometry.systems import rustle
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation.record import SimulatedDrive

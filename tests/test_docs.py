@@ -26,13 +26,13 @@ from setups import setup_of
 from typer.main import get_command
 
 import adaptune
-from adaptune import yaml12
+from adaptune._system import yaml12
+from adaptune._system.strict import ConfigurationError
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, FixedSet
 from adaptune.odometry.portfolio import Portfolio
 from adaptune.odometry.registry import ODOMETRIES, declare_here
 from adaptune.recording import SequenceConfig
-from adaptune.strict import ConfigurationError
 from adaptune.trajectory import read_tum
 from offline.config import OfflineStudyConfig, load_study
 from offline.train import train
@@ -280,6 +280,7 @@ def test_python_works():
             assert "<Study in runs/my: " in shown["study"]
 
 
+@pytest.mark.services  # takes long
 def test_the_notebook_runs_and_so_does_the_readme(folder, monkeypatch):
     cells = json.loads((ROOT / "docs/tune.ipynb").read_text("utf-8"))["cells"]
     codes = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]

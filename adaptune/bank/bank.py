@@ -16,13 +16,18 @@ from adaptune.bank.members import Agreement, spread
 from adaptune.bank.rest import Backoff
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
-from adaptune.odometry.base import LOST, Motions, OdometryInstance, Registration, Usage
+from adaptune.odometry.base import (
+    WITHOUT_POSE,
+    MemberState,
+    Motions,
+    OdometryInstance,
+    Registration,
+    Usage,
+)
 from adaptune.odometry.factory import Factory
 from adaptune.odometry.prepared import PreparedScan
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
-
-WARM_UP = 12.0  # seconds of the last scans that a member sees when it restarts
 
 
 class PastScan(NamedTuple):
@@ -193,7 +198,7 @@ class Lateness:
     def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
         """The poses of all members, `interval` seconds after the last; NaN if not in time."""
         self._intervals.append(interval)
-        registrations = [LOST] * len(self._members)
+        registrations = [WITHOUT_POSE] * len(self._members)
         for i in order:
             left = self._begun + median(self._intervals) / (self._rate or 1.0) - self._clock.now()
             if not self.absent[i] and (self._rate is None or self._members[i].ready(left)):
@@ -242,6 +247,11 @@ class Lateness:
         self._T_odom_given[i] = T_odom_sensor
 
     @property
+    def behind(self) -> NDArray[np.bool_]:
+        """Members that are late, or were removed, of shape (n_members,)."""
+        return self._owing | self.removed
+
+    @property
     def working(self) -> NDArray[np.bool_]:
         """Members that cannot be restarted now, of shape (n_members,)."""
         return self._owing | self.absent | self.away
@@ -256,16 +266,14 @@ class Bank(OdometryInstance):
     """Several instances, each with its own parameters and each on every scan.
 
     The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
-    others restart on the scans of the last seconds, at most once a second, and so do members that a
-    fault has ended, or that have rested. One that is lost again within a minute rests first, see
-    `Backoff`. `restarts` counts how often a member was restarted.
+    others restart on as many of the last seconds' scans as they need (`warm_up`), at most once a
+    second, and so do members that a fault has ended, or that have rested. One that is lost again
+    within a minute rests first, see `Backoff`. `restarts` counts how often a member was restarted.
 
     Parameters
     ----------
     sets
         Parameter sets by trial number. The first is the fixed one: it begins with all the weight.
-    warm_up
-        Seconds of the last scans that a member sees when it restarts.
     lost_track
         Metres a second by which motions may never differ and agree.
     cores
@@ -278,7 +286,6 @@ class Bank(OdometryInstance):
         self,
         make: Callable[[ParameterSet], OdometryInstance],
         sets: Mapping[int, ParameterSet],
-        warm_up: float = WARM_UP,
         lost_track: float = 3.0,
         cores: int = 1,
         rate: float | None = None,
@@ -308,12 +315,12 @@ class Bank(OdometryInstance):
         self._weights = np.eye(len(sets))[0]
         self._agreement = Agreement(len(sets), lost_track)
         self._short = ShortRegistrations()
-        self._lost = False
+        self._in_doubt = False
+        self._states: dict[int, MemberState] = {}
         self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
         self._losses = Backoff(len(sets))
         self._first: dict[Hashable, OdometryInstance] = {}
-        self._past: deque[PastScan] = deque()  # of the last seconds
-        self._warm_up = warm_up
+        self._past: list[PastScan] = []  # of the last seconds
 
     @property
     def faults(self) -> list[str]:
@@ -329,7 +336,7 @@ class Bank(OdometryInstance):
     def motions(self) -> Motions:
         # Of a member before it was restarted.
         members = dict(zip(self.trials, self._T_previous_current, strict=True))
-        return self._last_motion.motions._replace(members=members)
+        return self._last_motion.motions._replace(members=members, states=self._states)
 
     def prepare(self, scan: Scan) -> PreparedScan:
         prepared = PreparedScan(scan, self._first)
@@ -357,7 +364,7 @@ class Bank(OdometryInstance):
                 f"with these trials"
             )
         self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
-        self._lost = selection.in_doubt
+        self._in_doubt = selection.in_doubt
         self._asked = np.isin(self.trials, list(selection.restart))
         self._resting = np.isin(self.trials, list(selection.resting))
 
@@ -375,8 +382,9 @@ class Bank(OdometryInstance):
         self._T_previous_current = self._member_motions(T_odom_sensor)
         self._agreement.start()
         self._short.start(prepared.stamp, prepared.scan.points)
-        self._past = deque([PastScan(prepared, T_odom_sensor, T_previous_current)])
+        self._past = [PastScan(prepared, T_odom_sensor, T_previous_current)]
         self._last_motion.start(T_odom_sensor, T_previous_current)
+        self._tell_states(~self.late.absent)
         self._asked[:] = False
         # Those that still work on a scan begin when they are done.
         self._waking = self.late.absent & ~self._resting
@@ -405,15 +413,15 @@ class Bank(OdometryInstance):
         self._T_previous_current = T_previous_current
         self._short.add(scan.stamp, scan.scan.points)
         agreeing = self._agreement.judge(
-            T_previous_current, seconds, self._weights, self._short, self._lost
+            T_previous_current, seconds, self._weights, self._short, self._in_doubt
         )
+        self._tell_states(agreeing)
         if not agreeing.any():
-            return LOST
+            return WITHOUT_POSE
         T_odom_sensor = rectify(before.T_odom_sensor @ self._agreement.T_previous_current)
         T_before_now = invert(before.T_odom_sensor) @ T_odom_sensor
         self._past.append(PastScan(scan, T_odom_sensor, T_before_now))
-        while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._warm_up:
-            self._past.popleft()
+        self._past = self._last(max(member.warm_up for member in self._members))
         self.late.given(T_odom_sensor)
         self._catch_up()
         self._lose(self._agreement.due, scan.stamp)
@@ -423,6 +431,15 @@ class Bank(OdometryInstance):
     def close(self) -> None:
         for member in self._members:
             member.close()
+
+    def _tell_states(self, counts: NDArray[np.bool_]) -> None:
+        """Note what each member did over the newest scan; of those in the mask, motions count."""
+        self._states = dict.fromkeys(self.trials, "lost")
+        late, rests = self.late.behind, self.late.resting
+        masks: list[tuple[MemberState, NDArray[np.bool_]]]
+        masks = [("late", late), ("rests", rests), ("works", counts)]
+        for state, mask in masks:
+            self._states |= {self.trials[i]: state for i in np.flatnonzero(mask)}
 
     def _member_motions(self, T_odom_previous: Poses) -> Poses:
         return np.array([self.late.motion(i, T_odom_previous) for i in range(len(self._members))])
@@ -438,7 +455,7 @@ class Bank(OdometryInstance):
         members = members & ~np.array([member.given_up for member in self._members])
         members &= ~self.late.working
         due = [self._members[i] for i in self._isolated_first if members[i]]
-        successors = [Successor(member, self._past) for member in due]
+        successors = [Successor(member, self._last(member.warm_up)) for member in due]
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             # Those at the end register while those at the beginning do.
@@ -456,6 +473,11 @@ class Bank(OdometryInstance):
         self.restarts += int(members.sum())
         self._agreement.restarted(members)
         self._tell()
+
+    def _last(self, seconds: float) -> list[PastScan]:
+        """The scans of the last seconds, at least the newest one."""
+        begin = self._past[-1].scan.stamp - round(1e9 * seconds)  # no float holds stamps
+        return [past for past in self._past if past.scan.stamp >= begin]
 
     def _catch_up(self) -> None:
         """Let those that restart see the newest scan, and one of them scans of the past."""

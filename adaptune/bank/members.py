@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import processes
+from adaptune._system import processes
+from adaptune._system.machine import other_core
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, mean_motion
-from adaptune.machine import other_core
 from adaptune.odometry import wire
 from adaptune.odometry.base import InProcess, OdometryInstance, Usage
 from adaptune.odometry.factory import Factory, OdometryFactory
@@ -173,6 +173,7 @@ class Member(Isolated):
     ):
         super().__init__(factory.name, parameters, factory.settings, factory.limits)
         self._process, self._number = process, number
+        self.warm_up = factory.description.warm_up
         self._conversation: _Channel = _Channel(process, number)
         self._fresh = False
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from adaptune._system.files import write_text
 from adaptune.commands.terminal import (
     Cluster,
     Folder,
@@ -24,7 +25,6 @@ from adaptune.commands.terminal import (
     show_table,
 )
 from adaptune.errors import AdaptuneError, Finding
-from adaptune.files import write_text
 
 if TYPE_CHECKING:
     from adaptune.reference.stored import StoredEstimate
@@ -97,7 +97,7 @@ def offline(
         "Each set is driven as `adaptune online` does it. The drives of the finalists along whole "
         "recordings decide which set is the fixed one.",
     )
-    # Nothing can be left out of a single stretch.
+    # Nothing can be left out of a single segment.
     say_next_of_trained(loaded, validate=bool(model.expected))
 
 
@@ -130,17 +130,17 @@ def trials(
 
         say(f"{errors}: errors by frame and set; sets: {write_scenario(errors, scenario(loaded))}")
         return
-    from adaptune import trial_rows
-    from adaptune.archive import Archive
+    from adaptune.runs.archive import Archive
+    from offline.trial_table import headings, rows, select, with_units
 
     names, archive = loaded.training, Archive(loaded.folder / "trials")
-    finished = trial_rows.rows(archive, names)
+    finished = rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
     labels = loaded.odometry.space.labels
-    chosen = trial_rows.select(finished, sort, top, trial_rows.headings(names, labels))
+    chosen = select(finished, sort, top, headings(names, labels))
     title = f"{len(chosen)} of {len(finished)} trials"
-    show_table(title, trial_rows.with_units(chosen, names, labels))
+    show_table(title, with_units(chosen, names, labels))
     if judged := [row for row in finished if row["mean"] is not None]:
         best = min(judged, key=lambda row: row["mean"])
         say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
@@ -161,7 +161,7 @@ def validate(
 ) -> None:
     """Estimate what adapting gains in places without training data.
 
-    Leaves out one training recording after the other (with fewer than six, one stretch after the
+    Leaves out one training recording after the other (with fewer than six, one segment after the
     other), chooses on the rest what to drive, and looks up the errors of the sets that are selected
     in each period. No odometry runs. A bank averages the recorded motions of its members. Numbers
     are ratios to the error of the fixed set, which is chosen without what is left out, too.
@@ -174,13 +174,13 @@ def validate(
     for verdict in verdicts:
         say(verdict)
     show_table(
-        "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
+        "Error as a ratio to the fixed set's, each recording or segment left out in turn",
         rows,
         "The oracle knows the errors: the best set of the sequence. Intervals: "
         "for a recording, from blocks along it, if it is long enough; for the geometric "
-        "mean over the stretches, what is expected elsewhere.",
+        "mean over the segments, what is expected elsewhere.",
     )
-    say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
+    say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'segments'}.*")
     say_next_of_trained(loaded, validate=False)
 
 

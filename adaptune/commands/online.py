@@ -31,9 +31,9 @@ from adaptune.commands.terminal import (
 from adaptune.errors import AdaptuneError
 
 if TYPE_CHECKING:
+    from adaptune.runs.record import Run
     from offline.config import OfflineStudy
-    from online.compare import ComparedReplays
-    from online.replay import ReplayRecord
+    from online.compare import Comparison
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ Untrained = Annotated[
 Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2.")]
 Details = Annotated[bool, typer.Option("--details", help="Print all sentences and tables.")]
 Oracle = Annotated[
-    bool, typer.Option("--oracle", help="Run sets as trials: what was there to gain?")
+    bool, typer.Option("--oracle", help="Drive sets on the test: what was there to gain?")
 ]
 
 
@@ -139,7 +139,7 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
 def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
-    from adaptune.machine import pin
+    from adaptune._system.machine import pin
     from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
     from online.modes import UNTRAINED, WITHOUT_MODEL
@@ -151,16 +151,16 @@ def _drive(
     link = local_ros2() if ros2 else local_ros1()
     with closing(link), pin(os.getpid(), alone=True), progress() as show:
         log.info("drive, %s: Ctrl-C ends it", drive.mode)
-        driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))
-    dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
-    say(f"{driven.scans} scans{dropped}: {driven.folder}/")
+        run = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))
+    dropped = f", {run.dropped} of them dropped" if run.dropped else ""
+    say(f"{drive.done} scans{dropped}: {drive.folder}/")
 
 
-def now(record: "ReplayRecord") -> str:
+def now(run: "Run") -> str:
     """How a drive goes, in a few words."""
-    late = {"dropped": record.dropped, "selections missed": record.missed}
+    late = {"dropped": run.dropped, "selections missed": run.missed}
     words = [f"{n} {what}" for what, n in late.items() if n]
-    if (choice := record.newest) is not None:
+    if (choice := run.newest) is not None:
         words.append(f"trial {choice.selection.trial}")
         if math.isfinite(error := choice.selection.estimated_error):
             words.append(f"error {error:.2f} %")
@@ -186,9 +186,11 @@ Against = Annotated[
     ),
 ]
 OfFiles = Annotated[str | None, typer.Option(metavar="NAME", help="Of parameter files.")]
-Worse = Annotated[str, typer.Option(metavar="PERCENT", help="Error that is no matter.")]
+Worse = Annotated[
+    str, typer.Option(metavar="PERCENT", help="Increase of the error that is tolerated.")
+]
 Cost = Annotated[
-    str, typer.Option(metavar="PERCENT", help="Cost that is no matter; `off`: no cost is.")
+    str, typer.Option(metavar="PERCENT", help="Increase of the cost that is tolerated, or `off`.")
 ]
 Length = Annotated[
     float | None,
@@ -199,7 +201,7 @@ Length = Annotated[
     ),
 ]
 Unclear = Annotated[
-    Literal["pass", "fail"], typer.Option(help="What too little to tell counts as.")
+    Literal["pass", "fail"], typer.Option(help="How to treat an inconclusive result.")
 ]
 Out = Annotated[
     Path, typer.Option(help="Folder of verdict.json, junit.xml and summary.md.", file_okay=False)
@@ -256,11 +258,11 @@ def compare(
         return
     if any(of_both.values()):
         raise AdaptuneError(f"{_given(of_both)}: goes with --against, which names the other side")
-    from adaptune.tuning.tuned import compared
+    from adaptune.tuning.tuned import write_comparison
 
     loaded = _with_model(load(Path(study), override, folder), model)
     begin_work()
-    found, page = compared(loaded)
+    found, page = write_comparison(loaded)
     say_compared(loaded, found, page, details=details)
     _say_next(loaded, found)
 
@@ -269,7 +271,7 @@ def _with_model(loaded: "OfflineStudy", model: Path | None) -> "OfflineStudy":
     return loaded if model is None else replace(loaded, model_file=model)
 
 
-def _say_next(loaded: "OfflineStudy", found: "ComparedReplays") -> None:
+def _say_next(loaded: "OfflineStudy", found: "Comparison") -> None:
     from adaptune.paired import MIN_RECORDINGS
 
     if found.rows[0].yardstick == "baseline":
@@ -334,11 +336,9 @@ def percent(text: str, key: str) -> float:
 
 
 def say_compared(
-    loaded: "OfflineStudy", found: "ComparedReplays", page: Path, *, details: bool = False
+    loaded: "OfflineStudy", found: "Comparison", page: Path, *, details: bool = False
 ) -> None:
     """Print what to do and what may be driven; with `details`, all that is on the page."""
-    from adaptune import trial_rows
-    from adaptune.archive import Archive
     from online.tables import controls, tables
 
     length = loaded.config.sub_trajectory
@@ -350,10 +350,6 @@ def say_compared(
         say(sentence)
     for made in tables(found.rows, length) if details else controls(found.rows, length):
         show_table(*made)
-    if details and len(loaded.config.odometries) > 1:
-        finished = trial_rows.rows(Archive(loaded.folder / "trials"), loaded.training)
-        if each := trial_rows.by_odometry(finished):
-            show_table(*each)
 
 
 def record(

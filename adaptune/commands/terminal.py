@@ -13,8 +13,8 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+from adaptune._system.progress import Progress, bars
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError
-from adaptune.progress import Progress, bars
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from adaptune._system.files import write_text
 from adaptune.commands.online import Details, say_compared
 from adaptune.commands.terminal import (
     As,
@@ -23,7 +24,6 @@ from adaptune.commands.terminal import (
     show_table,
 )
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
 from adaptune.tuning import TRIALS
 
 if TYPE_CHECKING:
@@ -58,12 +58,12 @@ def inspect(
         return
     if file.suffix in (".yaml", ".yml") and _look(file):
         return
+    from adaptune._system.yaml12 import dump
     from adaptune.odometry.portfolio import portfolios_of
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
     from adaptune.tuning.asked import check_no_study
     from adaptune.tuning.studies import ROLES, proposed, roles
-    from adaptune.yaml12 import dump
 
     check_no_study(file)
     if study is not None and study.exists():
@@ -128,10 +128,10 @@ _LOOK = 20.0
 
 def _look(path: Path) -> bool:
     """Show what the ROS system of a study does; False if it has none."""
+    from adaptune._system.yaml12 import Document, YamlError
     from adaptune.odometry.registry import ROS_SYSTEMS
     from adaptune.trajectory import is_kitti
     from adaptune.tuning.studies import LACKING
-    from adaptune.yaml12 import Document, YamlError
 
     if path.is_file():
         given: Any = None
@@ -146,7 +146,7 @@ def _look(path: Path) -> bool:
     lines = enumerate(path.read_text("utf-8").splitlines(), 1)
     if lacking := [str(n) for n, line in lines if LACKING in line.partition("#")[0]]:
         raise AdaptuneError(f"{path}, line {', '.join(lacking)}: fill in what stands as {LACKING}")
-    from adaptune.odometry.docker.probe import far_ends, look
+    from adaptune.odometry.systems.probe import far_ends, look
 
     load(path, [], None, runs=True)  # what is not installed is told as by other commands
     name = loaded.config.training[0]
@@ -276,14 +276,14 @@ def tune(
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
     from adaptune.tuning.asked import Asked
-    from adaptune.tuning.studies import LACKING, proposed_system
+    from adaptune.tuning.studies import LACKING, write_system_study
     from adaptune.tuning.tuned import tune_asked
 
     odometry = odometry or ("gicp" if config is None else "kiss_icp")
     limits = (trials, minutes, budget, portfolio)
     asked = Asked(recordings, odometry, points, reference, config, test, reading, {}, *limits)
     with progress() as show:
-        if (path := proposed_system(asked, folder, show)) is None:
+        if (path := write_system_study(asked, folder, show)) is None:
             tuned = tune_asked(asked, override, folder, cluster, show)
     if path is not None:
         say(

@@ -15,8 +15,8 @@ from adaptune.commands.terminal import Points, progress, say
 from adaptune.errors import AdaptuneError
 
 if TYPE_CHECKING:
+    from adaptune._system.progress import Progress
     from adaptune.evaluation.given import Convention
-    from adaptune.progress import Progress
     from online.watch import Told
 
 log = logging.getLogger(__name__)
@@ -98,10 +98,10 @@ def _on_robot(
 ) -> Iterator["Told"]:
     from pydantic import TypeAdapter, ValidationError
 
-    from adaptune.machine import pin
+    from adaptune._system.machine import pin
+    from adaptune._system.strict import in_one_line
     from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
-    from adaptune.strict import in_one_line
     from adaptune.study.config import RosName
     from online.watch import watch_topics
 

@@ -10,12 +10,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from adaptune._system.progress import Progress, bars_and_words
 from adaptune.errors import AdaptuneError
 from adaptune.evaluation.given import Convention, Named, by_name, convention, read
 from adaptune.evaluation.judged import Judge, Judged, pair_of
 from adaptune.evaluation.shown import Compared, in_words, write_evaluation
 from adaptune.paired import ratio
-from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.config import ESTIMATED
 from adaptune.recording.fleet import Reading
 from adaptune.recording.inspect import Inspection
@@ -29,7 +29,7 @@ from adaptune.tuning.asked import Asked, check_guarded, recorded
 
 OUT = Path("runs/evaluate")
 _SILENT = 0.1  # share of a recording that may lack poses where an error is surely below a bound
-_OWN = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_OWN_POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 """Poses that systems seldom publish: where a bag has one such topic, it is its reference."""
 
 
@@ -161,7 +161,7 @@ def _own_reference(found: Inspection, trajectories: Collection[str]) -> str | No
     """The recording's own poses, where they are not among what is judged; else an estimate."""
     if found.reference is not None and "reference" not in found.used:
         return None  # those of a folder
-    own = [topic.name for topic in found.topics.values() if topic.type in _OWN]
+    own = [topic.name for topic in found.topics.values() if topic.type in _OWN_POSES]
     return own[0] if len(own) == 1 and own[0] not in trajectories else ESTIMATED
 
 

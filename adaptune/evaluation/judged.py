@@ -18,9 +18,9 @@ from adaptune.reference.check import FEWEST, LONGER
 from adaptune.reference.judge import Reference
 from adaptune.trajectory import Trajectory
 
-_PAUSE = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
+_GAP = 3.5  # times its usual step, and seconds at least 1, after which a trajectory gives nothing
 _RARE = 1.6  # times the judge's step, from which on a trajectory gives few poses, as keyframes
-_MOMENTS = 2000  # at which it is asked whether the judge knows a pose
+_JUDGED_MOMENTS = 2000  # at which it is asked whether the judge knows a pose
 
 
 class Judge(NamedTuple):
@@ -89,7 +89,7 @@ class Judged:
 
     @cached_property
     def errors(self) -> NDArray[np.float64]:
-        """Capped RTE in percent of the sub-trajectory from each pose, of shape (n,), or NaN."""
+        """Clipped RTE in percent of the sub-trajectory from each pose, of shape (n,), or NaN."""
         return self.judge.reference.errors(self.odometry)
 
     @cached_property
@@ -132,7 +132,7 @@ class Judged:
     def unknown_share(self) -> float:
         """Share of its time in which the judge knows no pose."""
         begin = max(self.trajectory.stamps[0], self.judge.begin)
-        at = np.linspace(begin, self.stamps[-1], _MOMENTS).astype(np.int64)
+        at = np.linspace(begin, self.stamps[-1], _JUDGED_MOMENTS).astype(np.int64)
         return float(np.isnan(self.judge.trajectory.at(at)[:, 0, 0]).mean())
 
     @cached_property
@@ -140,7 +140,7 @@ class Judged:
         """From when to when it gives nothing, in seconds of the recording, of shape (m, 2)."""
         ends = np.array([self.judge.begin, *self.trajectory.stamps, self.judge.end])
         steps = np.column_stack([ends[:-1], ends[1:]]) - self.judge.begin
-        usual = max(1e9, _PAUSE * float(np.median(np.diff(ends))))
+        usual = max(1e9, _GAP * float(np.median(np.diff(ends))))
         return np.asarray(1e-9 * steps[np.diff(ends) > usual])
 
     @property

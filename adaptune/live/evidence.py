@@ -17,13 +17,13 @@ from adaptune.live.hops import (
     HopCloud,
     HopErrors,
     Hops,
-    LiveSquares,
+    HopSquares,
     apart,
-    live_squares,
+    hop_squares,
     register,
 )
 from adaptune.live.monitor import HOPS_TO_BE_LOST, Health, HealthMonitor
-from adaptune.live.own_error import CONTRADICTED, FAMILIAR, OWN_SECONDS, Link, OwnError, OwnErrors
+from adaptune.live.own_error import CONTRADICTED, OWN_SECONDS, SIMILAR, Link, OwnError, OwnErrors
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import IN_DOUBT, Selection
@@ -325,11 +325,11 @@ class LiveEvidence:
         present = np.asarray(now - self._without[1:] > SECONDS)
         return present if present.any() else ~present
 
-    def squares(self, members: Collection[int] | None = None) -> LiveSquares | None:
+    def squares(self, members: Collection[int] | None = None) -> HopSquares | None:
         """What the last hops say of some members, by trial, or of all, or of a single odometry."""
         chosen = self.members if members is None else members
         columns = [i for i, trial in enumerate(self.members, 1) if trial in chosen] or [0]
-        return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
+        return hop_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
 
     def own_error(self) -> OwnError | None:
         """The odometry's, or the bank's, own error over the last metres; None if nothing tells."""
@@ -338,10 +338,10 @@ class LiveEvidence:
             return None
         return self._own.estimate()
 
-    def _own_error_with(self, predicted: float, familiarity: float) -> OwnError | None:
+    def _own_error_with(self, predicted: float, similarity: float) -> OwnError | None:
         """The same, with what training predicts where it knows the place."""
-        # Unknown where the training has one stretch.
-        share = 1.0 if np.isnan(familiarity) else min(1.0, familiarity / FAMILIAR)
+        # Unknown where the training has one segment.
+        share = 1.0 if np.isnan(similarity) else min(1.0, similarity / SIMILAR)
         alone = self.own_error()
         # A bank's prediction has live evidence in it already.
         if self.members or alone is None or not share or not alone.low <= CONTRADICTED * predicted:
@@ -357,7 +357,7 @@ class LiveEvidence:
         state, why = self.health
         restart = self._told_to_restart()
         selection = selection._replace(state=state, why=why, restart=restart)
-        error = self._own_error_with(selection.predicted_error, selection.familiarity)
+        error = self._own_error_with(selection.predicted_error, selection.similarity)
         if error is None:
             return selection
         return selection._replace(
@@ -379,12 +379,16 @@ PERIOD = 1_000_000_000  # nanoseconds from one registration to the next
 
 
 def hops_along(
-    scans: Iterable[tuple[Scan, Poses]], advance: Callable[[int], None] = lambda _: None
+    scans: Iterable[tuple[Scan, Poses]],
+    advance: Callable[[int], None] = lambda _: None,
+    *,
+    checks: bool = False,
 ) -> Hops:
     """Register scans directly to those some metres before, once a second.
 
     Known poses, of shape (4, 4), give each registration its first guess; where they are NaN,
-    nothing is measured. `advance` is called after every scan with how many are done.
+    nothing is measured. `advance` is called after every scan with how many are done. With `checks`,
+    the pose is checked each second, too, as selectors do: it then takes as long as theirs.
     """
     live = LiveEvidence()
     hops: list[tuple[int, int, Hop]] = []
@@ -401,6 +405,8 @@ def hops_along(
         due = due if i else scan.stamp
         if scan.stamp >= due:
             due += (int(scan.stamp - due) // PERIOD + 1) * PERIOD
+            if checks:
+                live.check()
             if (measured := live.measure()) is not None:
                 ends = frame_of[measured.start.stamp], frame_of[measured.end.stamp]
                 hops.append((*ends, measured.hop))

@@ -230,7 +230,7 @@ class HopErrors(NamedTuple):
         return HopErrors(*(array[kept] for array in self))
 
 
-class LiveSquares(NamedTuple):
+class HopSquares(NamedTuple):
     """Mean products of the errors of members over hops."""
 
     products: NDArray[np.float64]  # (n_members, n_members): percent squared
@@ -238,7 +238,7 @@ class LiveSquares(NamedTuple):
     windows: float  # number of hops that share no part of the path
 
 
-def live_squares(hops: HopErrors) -> LiveSquares | None:
+def hop_squares(hops: HopErrors) -> HopSquares | None:
     """Mean products of the errors over hops; None if there is no hop.
 
     The registration's error is common to all members. It adds the same to all products, so it
@@ -252,11 +252,11 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
     products = np.einsum("hix,hjx->ij", errors, errors) / n_hops
     products += np.diag(missing.mean(axis=0)) * CLIP**2
     noise = float(((100.0 * NOISE / length) ** 2).mean())
-    return LiveSquares(products, noise, windows(hops.start, hops.end))
+    return HopSquares(products, noise, windows(hops.start, hops.end))
 
 
 def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-    """How many stretches of a path, from metres to metres, amount to as much without overlap."""
+    """How many segments of a path, from metres to metres, amount to as much without overlap."""
     order = np.argsort(start)
     start, end = start[order], end[order]
     length = float((end - start).mean())
@@ -282,7 +282,7 @@ def clip_to_best(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
 
 
 def blend(
-    prior: NDArray[np.float64], prior_windows: float, live: LiveSquares | None
+    prior: NDArray[np.float64], prior_windows: float, hops: HopSquares | None
 ) -> NDArray[np.float64]:
     """Mean products of a prior and of what was measured, each weighted by its number of windows.
 
@@ -290,11 +290,11 @@ def blend(
     not how hard the place is for all of them. Without the registrations' own part, the harmonic
     means of the members' squares are then the same. Products are of shape (n_members, n_members).
     """
-    if live is None:
+    if hops is None:
         return prior
-    squares = live.products.diagonal()
+    squares = hops.products.diagonal()
     # Registrations that are as wrong as the members say little; never divide by nothing.
-    own = np.maximum(squares - live.noise, 0.25 * squares) + 1e-12
+    own = np.maximum(squares - hops.noise, 0.25 * squares) + 1e-12
     scale = (1.0 / own).mean() / (1.0 / np.maximum(prior.diagonal(), 1e-12)).mean()
-    total = prior_windows + live.windows
-    return np.asarray((prior_windows * prior + live.windows * scale * live.products) / total)
+    total = prior_windows + hops.windows
+    return np.asarray((prior_windows * prior + hops.windows * scale * hops.products) / total)

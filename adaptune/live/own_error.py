@@ -38,7 +38,7 @@ of its variance that all have in common."""
 LEAST = 0.01  # percent; no odometry is better
 CONTRADICTED = 2.0
 """A prediction does not count where the error is surely more than so many times as large."""
-FAMILIAR = 0.1  # a prediction counts less and less in places that are less familiar than this
+SIMILAR = 0.1  # a prediction counts less and less in places that are less familiar than this
 
 
 class OwnError(NamedTuple):

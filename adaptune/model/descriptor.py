@@ -1,62 +1,18 @@
 """Descriptors by name, one or several of them."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import processes
+from adaptune._system import processes
+from adaptune._system.strict import Plugins
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.odometry import wire
 from adaptune.odometry.content import python_content
 from adaptune.recording.scan import Scan
-from adaptune.strict import Plugins
-
-MOTION = "motion"
-"""Name of the descriptor that is filled in from poses."""
-SECOND = 10**9
-"""Nanoseconds over which motion is measured."""
-
-
-def unknown(scan: Scan) -> NDArray[np.float64]:  # noqa: ARG001 - poses give it
-    """Zeros in place of the motion until the poses are known, of shape (2,)."""
-    return np.zeros(2)
-
-
-def speed_and_turn_rate(stamps: NDArray[np.int64], T_odom_sensor: Poses) -> NDArray[np.float64]:
-    """Metres and radians a second over the last second before each pose, of shape (n, 2).
-
-    Stamps are rising nanoseconds. The motion is zero at the first pose. Unknown poses (NaN) take
-    the motion of the last known one.
-    """
-    known = np.flatnonzero(np.isfinite(T_odom_sensor).all(axis=(1, 2)))
-    if not len(known):
-        return np.zeros((len(stamps), 2))
-    at, T = stamps[known], T_odom_sensor[known]
-    before = np.maximum(np.searchsorted(at, at - SECOND, side="right") - 1, 0)
-    T_before_now = invert(T[before]) @ T
-    seconds = np.maximum((at - at[before]) * 1e-9, 1e-9)
-    moved = np.linalg.norm(T_before_now[:, :3, 3], axis=1)
-    motion = np.column_stack([moved, rotation_angle(T_before_now)]) / seconds[:, None]
-    latest = np.searchsorted(known, np.arange(len(stamps)), side="right") - 1
-    return np.asarray(motion[np.maximum(latest, 0)])
-
-
-def fill_in(
-    descriptors: NDArray[np.float32], blocks: Mapping[str, int], motion: NDArray[np.float64]
-) -> None:
-    """Write the motion (..., 2) into the block of the motion descriptor, if there is one.
-
-    Descriptors are of shape (..., n_features); `blocks` are their numbers by name, in order.
-    """
-    begin = 0
-    for name, size in blocks.items():
-        if name == MOTION:
-            descriptors[..., begin : begin + size] = motion
-        begin += size
-
 
 Descriptor = Callable[[Scan], NDArray[np.floating]]
 """Describes any scan, even an empty one, by the same number of finite numbers."""
@@ -64,10 +20,7 @@ Descriptor = Callable[[Scan], NDArray[np.floating]]
 ENTRY_POINTS = "adaptune.descriptors"
 """Group in which other packages announce their descriptors, each by its name."""
 
-DESCRIPTORS = {
-    "ndt": "adaptune.model.ndt:describe",
-    MOTION: "adaptune.model.descriptor:unknown",
-}
+DESCRIPTORS = {"ndt": "adaptune.model.ndt:describe"}
 
 
 class DescriptorError(AdaptuneError):
@@ -107,7 +60,7 @@ def descriptor_content(names: Iterable[str]) -> dict[str, str]:
     return {k: v for name in own for k, v in python_content(name, ENTRY_POINTS).items()}
 
 
-# What runs in a process of its own for a descriptor of the user, see `adaptune.processes`.
+# What runs in a process of its own for a descriptor of the user, see `adaptune._system.processes`.
 
 
 def load(name: str) -> None:
@@ -140,8 +93,6 @@ def _hosted(name: str) -> Descriptor:
 
 class Describer:
     """Describes scans by one or several descriptors, of these names (see `descriptor`).
-
-    The motion descriptor stays zero. `adaptune.model.descriptor.fill_in` fills it in.
 
     `blocks` says by name, in order, how many numbers each descriptor has.
     """
@@ -202,3 +153,10 @@ def averaged(
         total[there] += descriptors[before[there]]
         number += there
     return (total / number[:, None]).astype(np.float32)
+
+
+def compact(descriptors: NDArray[np.float32]) -> NDArray[Any]:
+    """Descriptors for a file. Counts become whole numbers, which take less room."""
+    with np.errstate(invalid="ignore"):
+        counts = descriptors.astype(np.uint16)
+    return counts if (counts == descriptors).all() else descriptors

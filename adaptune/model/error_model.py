@@ -17,21 +17,20 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from adaptune import __version__
-from adaptune.archive import compact
+from adaptune._system.files import replacing
+from adaptune._system.strict import in_one_line
 from adaptune.errors import AdaptuneError
-from adaptune.files import replacing
-from adaptune.model.descriptor import DESCRIPTORS
+from adaptune.model.descriptor import DESCRIPTORS, compact
 from adaptune.model.rules import Costs, TrainingData, allowed_sets, mean_errors
 from adaptune.model.weights import BankSettings
-from adaptune.recording.scan import stretch_numbers
+from adaptune.recording.scan import segment_numbers
 from adaptune.report import tables
 from adaptune.space import ParameterSets, SpaceError, in_words, load_space
-from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
 
-FORMAT = 9
+FORMAT = 10
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 
@@ -65,7 +64,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
     if digest(text["header"], arrays) != text["digest"]:
         raise ValueError("its content is not what was written")
-    for name, known in _TYPES.items():
+    for name, known in _ARRAY_TYPES.items():
         if arrays[name].dtype.str not in known:
             raise ValueError(f"{name} holds {arrays[name].dtype}, not {' or '.join(known)}")
     # Only in JSON are the trials' numbers texts.
@@ -75,10 +74,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 SAME_SENSOR = 3.0
 """Degrees by which the lowest points of one sensor's scans may differ between drives."""
 
-_TYPES = {
+_ARRAY_TYPES = {
     "descriptors": ("<u2", "<f4"),
     "sequence": ("<u4",),
-    "stretch": ("<u4",),
+    "segment": ("<u4",),
     "errors": ("<f4",),
     "vectors": ("<f4",),
 }
@@ -102,9 +101,9 @@ class ErrorModel:
     # (n_frames, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
     provenance: dict[str, Any]  # where the model comes from, for people
-    # (n_frames,): number of each frame's stretch in its recording; by
-    # default each recording is one stretch.
-    stretch: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    # (n_frames,): number of each frame's segment in its recording; by
+    # default each recording is one segment.
+    segment: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     bank: list[int] = field(default_factory=list)  # its members' trials, the fixed set's first
     bank_size: int = 0  # members that were asked for; costs may allow fewer
     # (n_frames, len(bank), 3): their errors as vectors, see `TrainingData`.
@@ -114,8 +113,8 @@ class ErrorModel:
     elevations: list[float] = field(default_factory=list)
     # Chosen on the training sequences.
     bank_settings: BankSettings = field(default_factory=BankSettings)
-    # What was expected of a bank with these settings, see `offline.tuning.Figures`; empty where too
-    # little is known to compare.
+    # What was expected of a bank with these settings, see `offline.bank_choice.Figures`; empty
+    # where too little is known to compare.
     expected: dict[str, float] = field(default_factory=dict)
     recommended: str = "fixed"  # the mode to drive
     budget: float | str | None = None  # the study's, see `OnlineConfig`
@@ -123,8 +122,8 @@ class ErrorModel:
     costs: Costs | None = None  # what the sets cost; None if it was not measured
 
     def __post_init__(self) -> None:
-        if not len(self.stretch):
-            object.__setattr__(self, "stretch", np.zeros(len(self.sequence), np.intp))
+        if not len(self.segment):
+            object.__setattr__(self, "segment", np.zeros(len(self.sequence), np.intp))
 
     def __repr__(self) -> str:
         what = f"{len(self.sets)} sets on {len(self.errors)} frames of {', '.join(self.sequences)}"
@@ -141,9 +140,9 @@ class ErrorModel:
 
         return ScaledPCA(self.blocks.values()).fit(self.descriptors)
 
-    def stretches(self) -> NDArray[np.intp]:
-        """Number of every frame's stretch among all of the model, of shape (n_frames,)."""
-        return stretch_numbers(self.sequence, self.stretch)
+    def segments(self) -> NDArray[np.intp]:
+        """Number of every frame's segment among all of the model, of shape (n_frames,)."""
+        return segment_numbers(self.sequence, self.segment)
 
     def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
         """What selection rules are fitted to; `pca` is what `pca` returned.
@@ -153,7 +152,7 @@ class ErrorModel:
         """
         data = TrainingData(
             pca.transform(self.descriptors),
-            self.stretches(),
+            self.segments(),
             self.errors,
             self.sets,
             self.fixed,
@@ -184,16 +183,13 @@ class ErrorModel:
         for name in self.blocks:
             if name not in DESCRIPTORS and name not in descriptors:
                 raise ModelError(
-                    f"{where}: uses the descriptor {name!r}, which is code of its author's; if you "
-                    f"trust it, name it in `descriptor`, too, or fit a model of your own "
-                    f"(`adaptune offline`)"
+                    f"{where}: uses the descriptor {name!r}, which adaptune does not have; if it "
+                    f"is code that you trust, name it in `descriptor`, too, or fit a model of your "
+                    f"own (`adaptune offline`)"
                 )
 
     def is_foreign(self, elevation: float) -> bool:
-        """Whether scans whose lowest points lie there come from no sensor of the training's.
-
-        `elevation` is the median of their `lowest_elevation`, in degrees.
-        """
+        """Whether a scan with that `lowest_elevation` comes from no sensor of the training's."""
         differences = [abs(elevation - known) for known in self.elevations]
         return bool(differences) and min(differences) > SAME_SENSOR
 
@@ -201,7 +197,7 @@ class ErrorModel:
         return {
             "descriptors": np.ascontiguousarray(compact(self.descriptors)),
             "sequence": self.sequence.astype(np.uint32),
-            "stretch": self.stretch.astype(np.uint32),
+            "segment": self.segment.astype(np.uint32),
             "errors": np.ascontiguousarray(self.errors, np.float32),
             "vectors": np.ascontiguousarray(self.vectors, np.float32),
         }
@@ -248,7 +244,7 @@ class ErrorModel:
             space = load_space(header.pop("space"))
             sets = ParameterSets(space, tuple(header.pop("trials")), tuple(header.pop("sets")))
             arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
-            for numbers in ("sequence", "stretch"):
+            for numbers in ("sequence", "segment"):
                 arrays[numbers] = arrays[numbers].astype(np.intp)
             model = cls(sets=sets, **header, **arrays)
             model.check()
@@ -269,8 +265,8 @@ class ErrorModel:
         n_frames, n_sets = self.errors.shape
         if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
             raise ValueError("the errors are not of as many frames as the descriptors")
-        if not self.sequence.shape == self.stretch.shape == (n_frames,):
-            raise ValueError("the errors are not of as many frames as the stretch numbers")
+        if not self.sequence.shape == self.segment.shape == (n_frames,):
+            raise ValueError("the errors are not of as many frames as the segment numbers")
         if not n_frames or len(self.sets) != n_sets or self.fixed not in self.sets:
             raise ValueError("errors and parameter sets do not go together")
         if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):
@@ -301,7 +297,7 @@ def _header_model() -> type[BaseModel]:
     own: dict[str, Any] = {
         of.name: (types[of.name], ... if of.default is MISSING else of.default)
         for of in fields(ErrorModel)
-        if of.name not in _TYPES
+        if of.name not in _ARRAY_TYPES
     }
     own["space"], own["trials"] = (dict[str, Any], ...), (list[int], ...)
     own["sets"] = (list[dict[str, Any]], ...)

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 from sklearn.decomposition import PCA
 
 from adaptune.metrics import FAILURE
-from adaptune.model.rules import NOTHING, Live, Rule, TrainingData
+from adaptune.model.rules import NOTHING, Evidence, Rule, TrainingData
 from adaptune.space import Selection
 
 N_COMPONENTS = 10
@@ -116,7 +116,7 @@ class NearestNeighbours(Rule):
         predicted = np.take_along_axis(errors, nearest, axis=1).mean(axis=1, dtype=np.float64)
         return np.where(self._allowed, predicted, np.inf)
 
-    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:  # noqa: ARG002
+    def select(self, feature: NDArray[np.float64], evidence: Evidence = NOTHING) -> Selection:  # noqa: ARG002
         """See `Rule.select`."""
         sets = self.data_.sets
         predicted = self.predict(feature)

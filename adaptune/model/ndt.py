@@ -8,7 +8,7 @@ leave the constants open; they are set here.
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.compiled import compiled
+from adaptune._system.compiled import compiled
 from adaptune.recording.scan import Scan
 
 CELL_SIZE = 1.0

@@ -4,10 +4,10 @@ from collections.abc import Callable, Collection
 from textwrap import shorten
 from typing import Any
 
+from adaptune._system.strict import Plugins
 from adaptune.errors import AdaptuneError, in_a_line
-from adaptune.model.rules import NOTHING, Live, Rule
+from adaptune.model.rules import NOTHING, Evidence, Rule
 from adaptune.space import ParameterSets, Selection
-from adaptune.strict import Plugins
 
 RULES = {
     "adaptive": "adaptune.model.weights:BankRule",
@@ -33,7 +33,7 @@ def rule_class(name: str, also: Collection[str] = ()) -> type[Rule]:
     return classes.derived(name, Rule, "adaptune.model.Rule")
 
 
-def asked(method: Callable[..., Any], *given: Any) -> Any:
+def call_user_code(method: Callable[..., Any], *given: Any) -> Any:
     """What a method of a rule returns; a `RuleError` says what goes wrong in it."""
     try:
         return method(*given)
@@ -44,10 +44,10 @@ def asked(method: Callable[..., Any], *given: Any) -> Any:
 
 
 def selected(
-    rule: Rule, sets: ParameterSets, feature: Any, live: Live = NOTHING, members: Any = None
+    rule: Rule, sets: ParameterSets, feature: Any, evidence: Evidence = NOTHING, members: Any = None
 ) -> Selection:
     """What a rule selects; a `RuleError` if that is none of the sets, or weighs other members."""
-    found: Selection = asked(rule.select, feature, live)
+    found: Selection = call_user_code(rule.select, feature, evidence)
     sound = isinstance(found, Selection) and found.trial in sets
     sound = sound and found.parameters == sets[found.trial]
     weighs = {*(found.weights or ())} if sound and members is not None else set()

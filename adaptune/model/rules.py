@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.live.hops import LiveSquares
+from adaptune.live.hops import HopSquares
 from adaptune.metrics import cap
 from adaptune.space import ParameterSets, Selection
 
 if TYPE_CHECKING:
     from adaptune.model.weights import BankSettings
 
-NOVEL_FAMILIARITY = 0.1
-"""Familiarity below which the nearest training frames count less and less."""
+NOVEL_SIMILARITY = 0.1
+"""Similarity below which the nearest training frames count less and less."""
 _QUANTILES = 10
 """Of the distances of each training sequence's frames from the other sequences."""
 
@@ -30,12 +30,12 @@ class NearFrames(NamedTuple):
     squared: NDArray[np.float64]  # (n_scans, n_sequences): mean squared distance of these frames
     # (n_scans,): share of the training frames that are farther from the other sequences than each
     # scan is from all of them; NaN of a single sequence, which has no others.
-    familiarity: NDArray[np.float64]
+    similarity: NDArray[np.float64]
 
     @property
     def trust(self) -> NDArray[np.float64]:
-        """How far they count for each scan, from 0 to 1: fully where familiarity is unknown."""
-        return np.asarray(np.fmin(1.0, self.familiarity / NOVEL_FAMILIARITY))
+        """How far they count for each scan, from 0 to 1: fully where similarity is unknown."""
+        return np.asarray(np.fmin(1.0, self.similarity / NOVEL_SIMILARITY))
 
     def weights(self, sharpness: float) -> NDArray[np.float64]:
         """Weights of the training sequences: the nearer their frames, the larger.
@@ -91,11 +91,11 @@ class NearestFrames:
         for s, (members, own) in enumerate(zip(self.members_, self.features_, strict=True)):
             squared[:, s], nearest = _nearest(own, features, self.n_frames)
             numbers.append(members[nearest])
-        familiarity = np.full(len(features), np.nan)
+        similarity = np.full(len(features), np.nan)
         if len(self.distances_):
             below = np.searchsorted(self.distances_, squared.min(axis=1), side="left")
-            familiarity = 1.0 - below / len(self.distances_)
-        return NearFrames(tuple(numbers), squared, familiarity)
+            similarity = 1.0 - below / len(self.distances_)
+        return NearFrames(tuple(numbers), squared, similarity)
 
     def _distances_between_sequences(self) -> NDArray[np.float64]:
         """Sorted distances of training frames from the other sequences, as many of each."""
@@ -201,7 +201,7 @@ class TrainingData:
     features
         Averaged descriptors, scaled, of shape (n_frames, n_features): what `Rule.select` gets.
     sequence
-        Number of each frame's stretch, of shape (n_frames,).
+        Number of each frame's segment, of shape (n_frames,).
     errors
         Sub-trajectory RTE in percent, of shape (n_frames, n_sets), infinite where the track was
         lost, NaN where the set was not run. Take `adaptune.metrics.cap` before a mean.
@@ -240,7 +240,7 @@ class TrainingData:
 
 
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Mean capped error of every set; each sequence has the same weight.
+    """Mean clipped error of every set; each sequence has the same weight.
 
     Errors are percent, of shape (n_frames, n_sets), NaN where a set was not run.
 
@@ -248,10 +248,10 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     error on a whole sequence, its mean is infinite: sequences differ more than sets do, so means
     over different sequences cannot be compared.
     """
-    capped = cap(errors)
+    clipped = cap(errors)
     means = []
     for s in np.unique(sequence):
-        of_sequence = capped[sequence == s]
+        of_sequence = clipped[sequence == s]
         known = ~np.isnan(of_sequence)
         if known.all():
             means.append(of_sequence.mean(axis=0))
@@ -282,11 +282,11 @@ def complementary(
     cost too much. A set that was not run on every sequence is not chosen.
     """
     everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
-    capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
+    clipped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
     chosen = [data.fixed]
     least = cap(data.errors[:, data.sets.column(data.fixed)])
     while len(chosen) < size:
-        means = mean_errors(np.minimum(capped, least[:, None]), data.sequence)
+        means = mean_errors(np.minimum(clipped, least[:, None]), data.sequence)
         now = means[data.sets.column(data.fixed)]
         means = np.where([allow([*chosen, trial]) for trial in data.sets], means, np.inf)
         best = int(np.argmin(means))
@@ -294,23 +294,23 @@ def complementary(
         if not means[best] < now:
             break
         chosen.append(data.sets.trials[best])
-        least = np.minimum(least, capped[:, best])
+        least = np.minimum(least, clipped[:, best])
     return chosen
 
 
-class Live(NamedTuple):
+class Evidence(NamedTuple):
     """What the drive has told so far."""
 
     # By trial, what was measured of sets that have done worse than predicted, in percent.
     worse: Callable[[], Mapping[int, float]] = dict
     # What was measured of some members of a bank, by trial.
-    squares: Callable[[Collection[int]], LiveSquares | None] = lambda _: None
+    squares: Callable[[Collection[int]], HopSquares | None] = lambda _: None
     # Of a bank's members, those that work where a place is so familiar, and so much is predicted of
     # the fixed set, in percent.
     at_work: Callable[[Sequence[int], float, float], Sequence[int]] = lambda members, *_: members
 
 
-NOTHING = Live()
+NOTHING = Evidence()
 """Before a drive, or without one."""
 
 
@@ -334,7 +334,7 @@ class Rule(ABC):
         """Learn, and compute whatever does not depend on the scan."""
 
     @abstractmethod
-    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
+    def select(self, feature: NDArray[np.float64], evidence: Evidence = NOTHING) -> Selection:
         """Choose a set, or weights, for one scan's scaled descriptor of shape (n_features,)."""
 
 
@@ -368,14 +368,14 @@ class FixedSet(Rule):
         self.nearest_ = NearestFrames(N_FRAMES).fit(data.features, data.sequence)
         return self
 
-    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
+    def select(self, feature: NDArray[np.float64], evidence: Evidence = NOTHING) -> Selection:
         """See `Rule.select`."""
         near = self.nearest_.near(feature[None])
         (predicted,) = np.einsum("qs,qsj->qj", near.weights(SHARPNESS), near.means(self.errors_))
         fixed = float(predicted[0])
         predicted = fixed + near.trust[0] * (predicted - fixed)
         errors = dict(zip(self.trials_, predicted.tolist(), strict=True))
-        trial, measured = self.data_.fixed, live.worse()
+        trial, measured = self.data_.fixed, evidence.worse()
         if trial in measured:
             errors |= {t: error for t, error in measured.items() if t in errors}
             trial = min(errors, key=lambda t: (errors[t], t != BASELINE))
@@ -384,5 +384,5 @@ class FixedSet(Rule):
             self.data_.sets[trial],
             predicted_error=float(predicted[self.trials_.index(trial)]),
             predicted_fixed=fixed,
-            familiarity=float(near.familiarity[0]),
+            similarity=float(near.similarity[0]),
         )

@@ -15,15 +15,15 @@ from pydantic import (
     PositiveInt,
 )
 
-from adaptune.live.hops import LiveSquares, blend
+from adaptune.live.hops import HopSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
     ERROR_FLOOR,
     N_FRAMES,
     NOTHING,
     SHARPNESS,
+    Evidence,
     FixedSet,
-    Live,
     NearestFrames,
     NearFrames,
     Rule,
@@ -50,7 +50,7 @@ class BankSettings(BaseModel):
 
     # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 12.0
-    # Nearest frames of each stretch: products of errors need more of them than means do.
+    # Nearest frames of each segment: products of errors need more of them than means do.
     n_frames: PositiveInt = 1000
     # Minimum share of the weight that the fixed set keeps where nothing was measured.
     min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
@@ -129,31 +129,31 @@ class BankRule(Rule):
         products, fixed = frames.means(self.products_), frames.means(self.fixed_squares_)
         return NearProducts(self.members_, frames, products, fixed)
 
-    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
+    def select(self, feature: NDArray[np.float64], evidence: Evidence = NOTHING) -> Selection:
         """See `Rule.select`."""
         near = self.near(feature[None])
-        familiarity = float(near.frames.familiarity[0])
-        members = live.at_work(self.members_, familiarity, self.predicted_fixed(near))
-        return self.weigh(near.of(members), live.squares(members))
+        similarity = float(near.frames.similarity[0])
+        members = evidence.at_work(self.members_, similarity, self.predicted_fixed(near))
+        return self.weigh(near.of(members), evidence.squares(members))
 
     def predicted_fixed(self, near: NearProducts) -> float:
         """Root mean square of the fixed set's error that is expected for one scan, in percent."""
         (of_sequences,) = near.frames.weights(self.settings.sharpness)
         return float(np.sqrt(of_sequences @ near.fixed[0]))
 
-    def weigh(self, near: NearProducts, live: LiveSquares | None) -> Selection:
+    def weigh(self, near: NearProducts, hops: HopSquares | None) -> Selection:
         """Weigh members for one scan; the others get no weight.
 
-        `live` is what was measured of them, in their order; None if nothing was.
+        `hops` is what was measured of them, in their order; None if nothing was.
         """
-        (weights,), (ratio,) = bank_weights(near, self.settings, [live])
+        (weights,), (ratio,) = bank_weights(near, self.settings, [hops])
         fixed = self.predicted_fixed(near)
         of_members = dict.fromkeys(self.members_, 0.0)
         of_members |= dict(zip(near.members, weights.tolist(), strict=True))
         return weighted_selection(self.data_.sets, of_members)._replace(
             predicted_error=float(ratio) * fixed,
             predicted_fixed=fixed,
-            familiarity=float(near.frames.familiarity[0]),
+            similarity=float(near.frames.similarity[0]),
         )
 
 
@@ -179,11 +179,11 @@ def weighted_selection(sets: ParameterSets, weights: Mapping[int, float]) -> Sel
 
 
 def bank_weights(
-    near: NearProducts, settings: BankSettings, live: Sequence[LiveSquares | None]
+    near: NearProducts, settings: BankSettings, hops: Sequence[HopSquares | None]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights of the members, and the root mean square that is expected of their mean.
 
-    `live` is what was measured of the members before each scan. Weights are of shape (n_scans,
+    `hops` is what was measured of the members before each scan. Weights are of shape (n_scans,
     n_members), ratios to the fixed set's root mean square of shape (n_scans,).
     """
     relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
@@ -194,9 +194,9 @@ def bank_weights(
     windows = settings.prior_windows * (
         UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.frames.trust
     )
-    squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
+    squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, hops, strict=True)])
     weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
-    measured = np.array([0.0 if one is None else one.windows for one in live])
+    measured = np.array([0.0 if one is None else one.windows for one in hops])
     kept = settings.min_fixed_share * windows / (windows + measured)
     weights *= (1.0 - kept)[:, None]
     weights[:, 0] += kept
@@ -206,7 +206,7 @@ def bank_weights(
     return weights, np.sqrt(mean_square / of_fixed)
 
 
-def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.float64]:
+def measured_weights(n_members: int, hops: HopSquares | None) -> NDArray[np.float64]:
     """Weights of members of which the training says nothing.
 
     Until something is measured, the first member has all the weight. From then on, the others get
@@ -214,10 +214,10 @@ def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.flo
 
     Returns shape (n_members,).
     """
-    if live is None:
+    if hops is None:
         return np.asarray(np.eye(n_members)[0])
     prior = _untried(n_members)
-    return minimum_variance_weights(blend(prior, BankSettings().prior_windows, live))
+    return minimum_variance_weights(blend(prior, BankSettings().prior_windows, hops))
 
 
 def _untried(n_members: int) -> NDArray[np.float64]:

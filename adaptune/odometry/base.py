@@ -5,20 +5,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_serializer, model_validator
 
+from adaptune._system.strict import StrictModel
 from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses, invert
 from adaptune.odometry.template import Template
 from adaptune.recording.config import resolve
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Selection
-from adaptune.strict import StrictModel
 
 MIN_POINTS = 20  # an adapter does not register scans with fewer points in range
+WARM_UP = 12.0
+"""Seconds of scans on which an odometry with a map has to begin within a drive."""
 
 
 class BaseSettings(StrictModel):
@@ -71,9 +73,9 @@ class Registration(NamedTuple):
     registered: bool = True  # False if the scan was too poor: the last motion then goes on
 
 
-LOST = Registration(np.full((4, 4), np.nan), registered=False)
+WITHOUT_POSE = Registration(np.full((4, 4), np.nan), registered=False)
 """What an odometry gives where there is no pose."""
-LOST.T_odom_sensor.setflags(write=False)
+WITHOUT_POSE.T_odom_sensor.setflags(write=False)
 
 
 class Usage(NamedTuple):
@@ -94,6 +96,11 @@ class Usage(NamedTuple):
         return cls(cpu, sum(known) if known else None, other_cpu=other)
 
 
+MemberState = Literal["works", "lost", "late", "rests"]
+"""Of a member of a bank over a scan: its motion counts, it is left out or restarts, it is late or
+was removed, or it rests."""
+
+
 class Motions(NamedTuple):
     """How the sensor moved over the last scan, before any health check."""
 
@@ -103,6 +110,8 @@ class Motions(NamedTuple):
     members: Mapping[int, Poses]
     # how often it has begun anew so far: one more than before means that it failed
     starts: int = 0
+    # what each member of a bank did, by trial number
+    states: Mapping[int, MemberState] = {}
 
 
 class Description(NamedTuple):
@@ -116,6 +125,7 @@ class Description(NamedTuple):
     whole: bool = False
     clean: bool = False  # whether instances in one process know nothing of each other
     module: str = ""  # in which a class is written
+    warm_up: float = WARM_UP  # see `Odometry`
 
 
 class OwnFile(NamedTuple):
@@ -166,6 +176,7 @@ class OdometryInstance(ABC):
     isolated: ClassVar[bool] = False
     # Whether it can be shown scans of the past again.
     rewinds: bool = True
+    warm_up: float = WARM_UP  # see `Odometry`
 
     @property
     def faults(self) -> Sequence[str]:
@@ -288,6 +299,8 @@ class Odometry(ABC):
         the process. Others run in a process of their own.
     needs_imu : bool
         Whether scans must bring along what an IMU measured.
+    warm_up : float
+        Seconds of past scans that one that begins within a drive has to see.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -307,6 +320,7 @@ class Odometry(ABC):
     live: ClassVar[bool]
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
+    warm_up: ClassVar[float] = WARM_UP
 
     def __init__(
         self,
@@ -335,7 +349,12 @@ class Odometry(ABC):
         if isinstance(settings, ToolSettings):
             cls(settings=settings)  # raises where a value does not fit
         known = cls.tuned(settings), cls.live, cls.needs_imu
-        return Description(*known, clean=cls.clean, module=cls.__module__)
+        if not 0.0 <= cls.warm_up < np.inf:
+            raise OdometryError(
+                f"{cls.__name__}: warm_up is {cls.warm_up}; give seconds, 0 or more"
+            )
+        described = Description(*known, clean=cls.clean, module=cls.__module__)
+        return described._replace(warm_up=cls.warm_up)
 
     @classmethod
     def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile | None:
@@ -392,7 +411,7 @@ class InProcess(OdometryInstance):
     faults: Sequence[str] = ()
 
     def __init__(self, odometry: Odometry):
-        self.odometry = odometry
+        self.odometry, self.warm_up = odometry, odometry.warm_up
         self._cpu = 0.0
 
     @property

@@ -12,7 +12,7 @@ from typing import Any
 
 from adaptune.odometry.registry import ENTRY_POINTS, ODOMETRIES, PACKAGES, PROGRAMS
 
-_SUFFIXES = machinery.all_suffixes()
+_MODULE_SUFFIXES = machinery.all_suffixes()
 
 Content = dict[str, str]
 """By what it is of, in words, a version or the hash of a file."""
@@ -83,7 +83,9 @@ def _imported(file: Path, folder: Path) -> list[Path]:
                 if "-packages" in str(root) or parts[0] in ("adaptune", "offline", "online"):
                     continue
                 wheres = accumulate(parts, Path.joinpath, initial=root)
-                files = (Path(f"{w}{end}") for w in wheres for end in ("/__init__.py", *_SUFFIXES))
+                files = (
+                    Path(f"{w}{end}") for w in wheres for end in ("/__init__.py", *_MODULE_SUFFIXES)
+                )
                 found += [one for one in files if one.is_file() and one not in found]
     return found[1:]
 
@@ -103,7 +105,7 @@ def module_file(name: str) -> Path | None:
 
 def _program(settings: Any) -> Content:
     if (image := getattr(settings, "image", None)) is not None:
-        from adaptune.odometry.docker.engine import image_digest
+        from adaptune.odometry.systems.engine import image_digest
 
         content = {f"image {image}": image_digest(image)}
         files: tuple[str | None, ...] = ()

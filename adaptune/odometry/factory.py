@@ -93,11 +93,14 @@ class OdometryFactory:
             return instance
         is_users = registry.is_user_class(self.name)
         if not self.description.clean or (is_users and not self.user_code):
-            return Isolated(self.name, given, self.settings, self.limits)
-        if is_users:
-            return Guarded(self.name, given, self.settings, self.limits.seconds)
-        cls: Any = registry.odometry_class(self.name)
-        return InProcess(cls(given, self.settings))
+            instance = Isolated(self.name, given, self.settings, self.limits)
+        elif is_users:
+            instance = Guarded(self.name, given, self.settings, self.limits.seconds)
+        else:
+            cls: Any = registry.odometry_class(self.name)
+            return InProcess(cls(given, self.settings))
+        instance.warm_up = self.description.warm_up
+        return instance
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from adaptune.geometry import Poses
-from adaptune.odometry.base import LOST, OdometryInstance, Registration
+from adaptune.odometry.base import WITHOUT_POSE, OdometryInstance, Registration
 from adaptune.space import ParameterSet
 
 MOST_FAULTS = 10
@@ -39,7 +39,7 @@ class Faulting(OdometryInstance):
         self.faults = [*self.faults, what]
         if self.given_up:
             _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
-        return LOST
+        return WITHOUT_POSE
 
 
 def pose_fault(T_odom_sensor: Poses) -> str | None:

@@ -9,11 +9,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from adaptune import processes
+from adaptune._system import processes
 from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
-from adaptune.odometry.base import LOST, Odometry, Registration, Usage
+from adaptune.odometry.base import WITHOUT_POSE, Odometry, Registration, Usage
 from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
@@ -79,7 +79,7 @@ class Guarded(Faulting):
             return found
 
         if not self._running:
-            return LOST
+            return WITHOUT_POSE
         begin = time.process_time()
         registration: Registration = self._noted(register, self._submitted)
         self._cpu += time.process_time() - begin
@@ -93,7 +93,7 @@ class Guarded(Faulting):
         self._odometry, self._running = None, False
 
     def _noted(self, call: Callable[[Odometry], Any], prepared: Any = None) -> Any:
-        """What a call of user code returns; after a fault, which is noted, it is `LOST`."""
+        """What a call of user code returns; after a fault, which is noted, it is `WITHOUT_POSE`."""
         try:
             return self._guarded(call, prepared)
         except processes.HostError as fault:

@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from adaptune._system.strict import StrictModel
 from adaptune.geometry import Poses, invert, rotation_angle, scale
-from adaptune.strict import StrictModel
 
 _STILL = 1e-6  # metres and radians by which a pose that stays where it is may move
 _WALK = 0.5  # metres a second

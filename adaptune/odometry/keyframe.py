@@ -9,10 +9,10 @@ import numpy as np
 import small_gicp
 from pydantic import Field
 
+from adaptune._system.open3d import load
 from adaptune.errors import import_extra
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
 from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, Odometry, Registration
-from adaptune.open3d import load
 from adaptune.recording.scan import Scan
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 
@@ -60,6 +60,7 @@ class KeyframeOdometry(Odometry):
     settings_type = KeyframeSettings
     live = True
     clean = True
+    warm_up = 0.0
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None

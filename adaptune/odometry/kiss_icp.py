@@ -12,7 +12,8 @@ from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from adaptune import yaml12
+from adaptune._system import yaml12
+from adaptune._system.strict import in_one_line
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import (
@@ -27,7 +28,6 @@ from adaptune.odometry.base import (
 from adaptune.odometry.own_frame import END, MIDDLE, AtStamp, duration_of
 from adaptune.recording.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
-from adaptune.strict import in_one_line
 
 _SECTION = {
     name: section

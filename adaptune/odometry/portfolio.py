@@ -8,13 +8,13 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
-from adaptune import manifest
+from adaptune._system import manifest
+from adaptune._system.strict import StrictModel, validated
+from adaptune._system.yaml12 import Document
 from adaptune.errors import AdaptuneError, Finding, nearest
 from adaptune.recording.cache import status_key
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Value
-from adaptune.strict import StrictModel, validated
-from adaptune.yaml12 import Document
 
 FOLDER = Path(__file__).parent / "portfolios"
 """Those that adaptune brings, a file for each odometry."""

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
-from adaptune import processes
+from adaptune._system import processes
+from adaptune._system.files import locked, replacing_folder, temporary_folder
 from adaptune.errors import OdometryError, UnavailableError, nearest
-from adaptune.files import locked, replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
 from adaptune.metrics import window_ends
 from adaptune.odometry.base import BaseSettings, Description, OwnFile, Registration, Usage

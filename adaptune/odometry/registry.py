@@ -11,14 +11,14 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, RootModel
 
-from adaptune import processes
+from adaptune._system import processes
+from adaptune._system.strict import Plugins, validated
 from adaptune.errors import Finding, NotInstalledError, OdometryError, hidden
 from adaptune.odometry import wire
 from adaptune.odometry.base import Description, Odometry, ToolSettings
 from adaptune.odometry.remote import SERVICE
 from adaptune.odometry.template import Template
 from adaptune.space import ParameterSet, ParameterSpace
-from adaptune.strict import Plugins, validated
 
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
@@ -41,11 +41,11 @@ ODOMETRIES = {
 
 PROGRAMS = {
     "command": "adaptune.odometry.program:Command",
-    "docker_command": "adaptune.odometry.docker.programs:DockerCommand",
-    "docker_process": "adaptune.odometry.docker.programs:DockerProcess",
+    "docker_command": "adaptune.odometry.systems.programs:DockerCommand",
+    "docker_process": "adaptune.odometry.systems.programs:DockerProcess",
     "process": "adaptune.odometry.remote:Process",
-    "ros2": "adaptune.odometry.docker.ros2_system:Ros2",
-    "rustle": "adaptune.odometry.docker.rustle:Rustle",
+    "ros2": "adaptune.odometry.systems.ros2_system:Ros2",
+    "rustle": "adaptune.odometry.systems.rustle:Rustle",
 }
 """Programs of the user."""
 
@@ -204,7 +204,7 @@ def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
         process.close()
 
 
-# What runs in a process of its own for an odometry, see `adaptune.processes`.
+# What runs in a process of its own for an odometry, see `adaptune._system.processes`.
 
 load = odometry_class
 

@@ -13,16 +13,16 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_validator
 
-from adaptune import processes
+from adaptune._system import processes
+from adaptune._system.machine import next_core
+from adaptune._system.strict import StrictModel
 from adaptune.errors import OdometryError, UnavailableError
 from adaptune.geometry import Poses
-from adaptune.machine import next_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import LOST, BaseSettings, Description, Registration, Usage
+from adaptune.odometry.base import WITHOUT_POSE, BaseSettings, Description, Registration, Usage
 from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
-from adaptune.strict import StrictModel
 
 SERVICE = "adaptune.odometry.registry"  # what a server does with an odometry
 
@@ -143,7 +143,7 @@ class Isolated(Faulting):
         answer = self._receive()
         self._busy = False
         if answer is None:
-            return LOST
+            return WITHOUT_POSE
         try:
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]

@@ -12,11 +12,11 @@ from operator import getitem
 from pathlib import Path
 from typing import Any
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.errors import OdometryError, nearest, warn_once
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 
-_SUFFIXES = (".yaml", ".yml", ".json")
+_FILE_SUFFIXES = (".yaml", ".yml", ".json")
 _ROS2 = "ros__parameters"
 
 _Place = tuple[tuple[str, ...], Any, Any, tuple[Any, ...]]
@@ -34,8 +34,8 @@ class Template:
 
     def __init__(self, path: Path):
         self.path = path
-        if path.suffix not in _SUFFIXES:
-            raise OdometryError(f"{path}: a template is a file of {', '.join(_SUFFIXES)}")
+        if path.suffix not in _FILE_SUFFIXES:
+            raise OdometryError(f"{path}: a template is a file of {', '.join(_FILE_SUFFIXES)}")
         try:
             # Ends of lines stay as they are, and comments in another encoding.
             self._text = path.read_bytes().decode(errors="surrogateescape")

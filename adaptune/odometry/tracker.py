@@ -2,18 +2,18 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from adaptune.geometry import Poses, invert, rectify, rotation_angle
-from adaptune.odometry.base import Motions, OdometryInstance
+from adaptune.odometry.base import MemberState, Motions, OdometryInstance
 from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.recording.scan import Scan
 
-WARM_UP = 2.0
+RESTART_WARM_UP = 2.0
 """Seconds of scans that an odometry sees again where it restarts with other parameters."""
 
 
@@ -27,6 +27,7 @@ class RegisteredScan(NamedTuple):
     prepare_seconds: float
     register_seconds: float
     begun: bool = True  # False before the odometry's first pose: the scan's is unknown
+    states: Mapping[int, MemberState] = {}  # of a bank, see `Motions`
 
 
 class _Seen(NamedTuple):
@@ -47,9 +48,9 @@ class Tracker:
     health: HealthCheck
     # Called with the stamp of a scan and what is wrong, before the odometry restarts. It may
     # change the parameters; if it says that it did, the odometry sees the scans of the last
-    # `WARM_UP` seconds again. If its motion is still not healthy then, it restarts without a
-    # past.
-    fall_back: Callable[[int, str], bool] | None = None
+    # `RESTART_WARM_UP` seconds again. If its motion is still not healthy then, it restarts without
+    # a past.
+    on_unhealthy: Callable[[int, str], bool] | None = None
     # The pose of the first scan, and the motion that led there; None if the sensor stood still.
     T_odom_start: Poses = field(default_factory=lambda: np.eye(4))
     T_before_start: Poses | None = None
@@ -86,14 +87,17 @@ class Tracker:
         if self._last is None:
             T_odom_sensor, T_previous_current = self.T_odom_start, self.T_before_start
             self.odometry.start(prepared, T_odom_sensor, T_previous_current)
+            states = self.odometry.motions.states
         elif not self._last.begun:
             T_odom_sensor, T_previous_current = self._last.T_odom_sensor, None
             T, registered = self.odometry.register(prepared)
+            states = self.odometry.motions.states
             if self.odometry.begun and np.isfinite(T).all():
                 T_odom_sensor = T
         else:
             T_odom_previous = self._last.T_odom_sensor
             T_odom_sensor, registered = self.odometry.register(prepared)
+            states = self.odometry.motions.states  # before it may restart
             elapsed = (stamp - self._last.stamp) * 1e-9
             with np.errstate(invalid="ignore"):  # the pose may be infinite
                 T_previous_current = invert(T_odom_previous) @ T_odom_sensor
@@ -105,7 +109,7 @@ class Tracker:
                 T_odom_sensor = rectify(T_odom_previous @ T_previous_healthy @ T_healthy)
                 T_previous_current = T_healthy
                 T_warm = None
-                if self.fall_back is not None and self.fall_back(stamp, unhealthy):
+                if self.on_unhealthy is not None and self.on_unhealthy(stamp, unhealthy):
                     prepared = prepared if scan is None else self.odometry.prepare(scan)
                     T_warm = self._warm_up(prepared, T_healthy, elapsed)
                 if T_warm is None:
@@ -113,10 +117,10 @@ class Tracker:
                 else:
                     T_odom_sensor = T_warm
                 self._T_jumped = invert(T_odom_previous) @ T_odom_sensor
-        if self.fall_back is not None and scan is not None and self.odometry.rewinds:
+        if self.on_unhealthy is not None and scan is not None and self.odometry.rewinds:
             self._remember(scan, prepared, T_odom_sensor, T_previous_current)
         seconds, begun = time.perf_counter() - begin, self.odometry.begun
-        result = (registered and begun, unhealthy, prepare_seconds, seconds, begun)
+        result = (registered and begun, unhealthy, prepare_seconds, seconds, begun, states)
         self._last = RegisteredScan(stamp, T_odom_sensor, *result)
         return self._last
 
@@ -125,7 +129,7 @@ class Tracker:
     ) -> None:
         preparation = self.odometry.preparation
         self._seen.append(_Seen(scan, preparation, prepared, T_odom_sensor, T_previous_current))
-        while scan.stamp - self._seen[0].scan.stamp > WARM_UP * 1e9:
+        while scan.stamp - self._seen[0].scan.stamp > RESTART_WARM_UP * 1e9:
             self._seen.popleft()
 
     def _warm_up(self, prepared: Any, T_healthy: Poses, elapsed: float) -> Poses | None:

@@ -13,25 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from adaptune._system.processes import Answer, HostError, Message
+from adaptune._system.strict import in_one_line
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Description, Registration
-from adaptune.processes import Answer, HostError, Message
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
-from adaptune.strict import in_one_line
 
 VERSION = 2
-_COLUMNS = ("points", "times", "rings", "intensities")
-_IMU = ("imu", "imu_stamps", "imu_pose", "imu_noise")
+_SCAN_ARRAYS = ("points", "times", "rings", "intensities")
+_IMU_ARRAYS = ("imu", "imu_stamps", "imu_pose", "imu_noise")
 
 
 def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
     """A scan as the arrays of a message."""
-    arrays: dict[str, NDArray[Any] | None] = {name: getattr(scan, name) for name in _COLUMNS}
+    arrays: dict[str, NDArray[Any] | None] = {name: getattr(scan, name) for name in _SCAN_ARRAYS}
     if (imu := scan.imu) is not None:
         measured = np.hstack([imu.angular_velocity, imu.acceleration])
         noise = np.array(imu.noise)
-        arrays |= zip(_IMU, (measured, imu.stamps, imu.T_sensor_imu, noise), strict=True)
+        arrays |= zip(_IMU_ARRAYS, (measured, imu.stamps, imu.T_sensor_imu, noise), strict=True)
     return arrays
 
 
@@ -39,10 +39,10 @@ def to_scan(message: Message) -> Scan:
     """The scan that a message holds."""
     arrays, imu = message.arrays, None
     if "imu" in arrays:
-        measured, stamps, T_sensor_imu, noise = (arrays[name] for name in _IMU)
+        measured, stamps, T_sensor_imu, noise = (arrays[name] for name in _IMU_ARRAYS)
         gyro, acceleration = np.hsplit(measured, 2)
         imu = Imu(stamps, gyro, acceleration, T_sensor_imu, ImuNoise(*noise.tolist()))
-    columns: Any = {name: arrays.get(name) for name in _COLUMNS}
+    columns: Any = {name: arrays.get(name) for name in _SCAN_ARRAYS}
     return Scan(message.header["stamp"], imu=imu, **columns)
 
 

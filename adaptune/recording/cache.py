@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import platformdirs
 
+from adaptune._system.files import DAMAGED_NPZ, expand_user, replacing
 from adaptune.errors import AdaptuneError, MachineError
-from adaptune.files import DAMAGED_NPZ, expand_user, replacing
 from adaptune.recording.scan import Scan
 
 _log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ _CAP_GB, _MOST_GB = 50.0, 1e9
 _DEAD, _UNLOCKED = 3600.0, 10.0
 _INDEX, _ABOUT = "index.npy", "about.json"
 # Files of an entry: what they hold of scans one after the other, and in how many columns.
-_ARRAYS = {
+_CACHED_ARRAYS = {
     "points": ("<f4", 3),
     "times": ("<f4", 1),
     "rings": ("<u2", 1),
@@ -88,7 +88,9 @@ class CachedScans:
             raise ValueError("a scan has no points")
         ends = self._index[:, 2::2].max(axis=0, initial=0).tolist()
         # All at once: mapped arrays stay even if another process removes the entry.
-        self._arrays = [self._map(name, end) for name, end in zip(_ARRAYS, ends, strict=True)]
+        self._arrays = [
+            self._map(name, end) for name, end in zip(_CACHED_ARRAYS, ends, strict=True)
+        ]
         # Records when the entry was last used.
         with suppress(OSError):  # a folder that only others may write to
             os.utime(path / _ABOUT)
@@ -112,7 +114,7 @@ class CachedScans:
         return (self[i] for i in range(first, len(self)))
 
     def _map(self, name: str, length: int) -> Any:
-        kind, columns = _ARRAYS[name]
+        kind, columns = _CACHED_ARRAYS[name]
         shape = (length, columns)[: 2 if columns > 1 else 1]
         if not length:  # an empty file cannot be mapped
             return np.empty(shape, kind)
@@ -145,7 +147,7 @@ class _Writer:
         # Others may read it as far as the umask lets them.
         self._folder = root / f".writing-{secrets.token_hex(4)}"
         self._folder.mkdir()
-        self._files = {name: (self._folder / name).open("wb") for name in _ARRAYS}
+        self._files = {name: (self._folder / name).open("wb") for name in _CACHED_ARRAYS}
         with suppress(OSError):  # a disk without locks
             fcntl.flock(self._files["points"], fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._index: list[list[int]] = []
@@ -153,7 +155,7 @@ class _Writer:
     def append(self, scan: Scan) -> None:
         row = [scan.stamp]
         for name, file in self._files.items():
-            kind, columns = _ARRAYS[name]
+            kind, columns = _CACHED_ARRAYS[name]
             begin = file.tell() // (np.dtype(kind).itemsize * columns)
             values = getattr(scan, name)
             if values is not None:
@@ -165,7 +167,7 @@ class _Writer:
         """Put the entry in its place, with notes on the sequence (plain data)."""
         for file in self._files.values():
             file.close()
-        index = np.array(self._index, np.int64).reshape(-1, 1 + 2 * len(_ARRAYS))
+        index = np.array(self._index, np.int64).reshape(-1, 1 + 2 * len(_CACHED_ARRAYS))
         np.save(self._folder / _INDEX, index)
         (self._folder / _ABOUT).write_text(json.dumps(about, indent=1), "utf-8")
         make_room(_size(self._folder))
@@ -194,7 +196,7 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
         except OSError as error:
             _log.warning(_NOT_KEPT, about.get("name"), error)
         for scan in scans:
-            arrays = (getattr(scan, name, None) for name in _ARRAYS)
+            arrays = (getattr(scan, name, None) for name in _CACHED_ARRAYS)
             total += sum(array.nbytes for array in arrays if array is not None)
             if writer is not None and total > cap():
                 _log.warning(_NOT_KEPT, about.get("name"), "larger than the cache may grow")
@@ -270,10 +272,10 @@ def _size(path: Path) -> int:
 
 
 SMALL = 1 << 24  # bytes of files below which their content is read every time
-FILE = "fingerprints.txt"
+FINGERPRINTS = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
 MANY = 64  # so many files have one hash together
-_LONG = 1 << 30  # bytes that take more than a second to read
+_SLOW_BYTES = 1 << 30  # bytes that take more than a second to read
 _SIZE = 16
 remembered: dict[str, str] = {}
 """Hashes that this process knows, also where the cache's folder cannot be written."""
@@ -287,7 +289,7 @@ def fingerprints(files: Sequence[Path]) -> list[str]:
         keys = [status_key(file) for file in files]
         size = sum(file.stat().st_size for file in files)
         known = _recall(keys) if size >= SMALL else {}
-        if size > _LONG and len(known) < len(keys):
+        if size > _SLOW_BYTES and len(known) < len(keys):
             _log.info("%s: reading %.1f GB to know it by its content", files[0], size / 1e9)
         for file, key in zip(files, keys, strict=True):
             if key not in known:
@@ -322,7 +324,7 @@ def _recall(keys: Sequence[str]) -> dict[str, str]:
     """The hashes that are known for these keys, here or on disk."""
     if not remembered.keys() >= set(keys):
         with suppress(OSError, UnicodeDecodeError):
-            for line in (folder() / FILE).read_text("ascii").splitlines():
+            for line in (folder() / FINGERPRINTS).read_text("ascii").splitlines():
                 key, _, found = line.partition(" ")
                 if len(key) == len(found) == 2 * _SIZE:
                     remembered[key] = found
@@ -334,5 +336,5 @@ def _remember(new: dict[str, str]) -> None:
     with suppress(OSError):
         folder().mkdir(parents=True, exist_ok=True)
         # One write: processes that append at the same time do not mix their lines.
-        with (folder() / FILE).open("ab", buffering=0) as stream:
+        with (folder() / FINGERPRINTS).open("ab", buffering=0) as stream:
             stream.write("".join(f"{key} {found}\n" for key, found in new.items()).encode())

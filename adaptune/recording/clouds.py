@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.compiled import compiled
+from adaptune._system.compiled import compiled
 from adaptune.errors import AdaptuneError
 from adaptune.recording.scan import Scan
 from adaptune.recording.timing import AUTO, TIME_FIELDS, Timing, TimingError, Unit
@@ -89,7 +89,7 @@ RING_FIELDS = ("ring", "line", "channel", "laser_id")
 # CloudCompare puts a prefix before the names of what it stores in a PLY file.
 INTENSITY_FIELDS = ("intensity", "reflectivity", "scalar_intensity", "scalar_Intensity")
 FARTHEST = 1000.0  # metres beyond which a point is doubted
-_NEVER = 1e4  # metres beyond which no LiDAR sees
+_OUT_OF_SIGHT = 1e4  # metres beyond which no LiDAR sees
 
 
 Field = tuple[str, int, int, int]
@@ -275,7 +275,7 @@ def _marks(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
     # Marks are all at one distance. Nothing that is measured is.
     far = seen & (away > FARTHEST)
     same = far & (np.abs(away / np.median(away[far]) - 1.0) < 1e-6) if far.any() else far
-    marks = (far & (away > _NEVER)) | (same & (np.count_nonzero(same) > 2))
+    marks = (far & (away > _OUT_OF_SIGHT)) | (same & (np.count_nonzero(same) > 2))
     rest = seen & ~same
     middle = np.median(away[rest]) if rest.any() else 0.0
     if middle <= FARTHEST and np.count_nonzero(marks & rest) <= 0.1 * np.count_nonzero(rest):

@@ -13,7 +13,7 @@ from adaptune.recording.scan import Scan
 from adaptune.trajectory import Trajectory
 
 # Rotation changes slowly: between these many moments of a scan it is taken as constant.
-_MOMENTS = 64
+_SWEEP_MOMENTS = 64
 # Metres: cells and search radius for the registration of a scan with its neighbour.
 _CELL, _REACH = 0.5, 2.0
 _FEWEST = 20  # small_gicp crashes on an empty target
@@ -32,12 +32,12 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
 
     twist = Rotation.from_matrix(T_start_end[:3, :3]).as_rotvec() / duration
     velocity = T_start_end[:3, 3] / duration
-    moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
+    moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _SWEEP_MOMENTS)
     matrices = Rotation.from_rotvec(moments[:, None] * twist).as_matrix().astype(np.float32)
     # The rotation of a point is looked up on a grid fine enough that the step between neighbours,
     # a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
-    place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
-    low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
+    place = np.clip(scan.times / np.float32(moments[1]), 0, _SWEEP_MOMENTS - 1)
+    low = np.minimum(place.astype(np.intp), _SWEEP_MOMENTS - 2)
     share = (place - low).astype(np.float32)[:, None]
     before = np.einsum("nij,nj->ni", matrices[low], scan.points)
     after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
@@ -119,7 +119,7 @@ def clock_offset(
         return None
     turned = geometry.rotation_angle(geometry.steps(trajectory.T_world_sensor))
     seconds = np.diff(trajectory.stamps) * 1e-9
-    middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
+    middles = trajectory.seconds[:-1] + seconds / 2
     other = (stamps - stamps[0]) * 1e-9
     # Each is a mean over the time between its samples: it is averaged over the other's too.
     a = _sampled(middles, turned / seconds, float(np.median(np.diff(other))))

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
 from adaptune import geometry
+from adaptune._system.files import entries, expand_user
+from adaptune._system.strict import StrictModel
 from adaptune.errors import AdaptuneError
-from adaptune.files import entries, expand_user
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, SequenceError
 from adaptune.recording.timing import Mark, Unit
-from adaptune.strict import StrictModel
 
 Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""

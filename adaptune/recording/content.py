@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.compiled import compiled
+from adaptune._system.compiled import compiled
 from adaptune.errors import Finding, Key
 from adaptune.geometry import nearest_rotation
 from adaptune.recording.scan import Reading, Scan

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.files import write_text
+from adaptune._system.files import write_text
 from adaptune.recording.clouds import livox_points
 from adaptune.recording.scan import Imu, Scan
 
@@ -21,7 +21,7 @@ Layout = Literal["bag", "ros2", "kitti"]
 
 POINTS, IMU = "/points", "/imu"  # topics of the bags
 
-_KINDS = {"<f4": 7, "<u2": 4}
+_DATATYPES = {"<f4": 7, "<u2": 4}
 
 
 class Messages:
@@ -51,7 +51,9 @@ class Messages:
         field = self.types["sensor_msgs/msg/PointField"]
         layout: Any = cloud.dtype.fields
         fields = [
-            field(name=name, offset=layout[name][1], datatype=_KINDS[layout[name][0].str], count=1)
+            field(
+                name=name, offset=layout[name][1], datatype=_DATATYPES[layout[name][0].str], count=1
+            )
             for name in cloud.dtype.names or ()
         ]
         return self.types["sensor_msgs/msg/PointCloud2"](

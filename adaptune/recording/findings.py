@@ -57,7 +57,7 @@ class Topic:
         return float(self.steps.max()) if len(self.steps) else None
 
 
-_STILL = 0.01  # metres
+_AT_REST = 0.01  # metres
 _MISSED = 0.01  # of the messages of a topic: fewer are not told
 
 _UNDECODED = {
@@ -152,7 +152,7 @@ _LEAP, _PAUSE = 10 * 10**9, 600 * 10**9  # nanoseconds that no clock, and no dri
 def clock_parts(stamps: NDArray[np.int64], recorded: NDArray[np.int64]) -> list[Part]:
     """Cut messages where their clock leaps for good, by stamps and the recorder's clock: (n,).
 
-    Where both clocks were set back, a stretch of time comes twice, and messages as often again.
+    Where both clocks were set back, a segment of time comes twice, and messages as often again.
     """
     n, steps, passed = len(stamps), np.diff(stamps), np.diff(recorded)
     cuts = {0: False, n: False}  # whether what begins there comes twice
@@ -236,7 +236,7 @@ def of_reference(
         yield angles
         return
     positions = reference.T_world_sensor[:, :3, 3]
-    if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
+    if np.linalg.norm(positions - positions[0], axis=1).max() < _AT_REST:
         what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
         mend = "errors are per metre; drive, or name another topic or a file of poses"
         yield Finding((), what, mend, of=role, lacks=lacks)

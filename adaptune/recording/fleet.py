@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from adaptune.files import entries
+from adaptune._system.files import entries
 from adaptune.recording.bag import UNOPENED, BagSource
 from adaptune.recording.config import BAG_SUFFIXES, bag_paths
 from adaptune.recording.scan import SequenceError

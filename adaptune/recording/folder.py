@@ -17,9 +17,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry, open3d
+from adaptune import geometry
+from adaptune._system import open3d
+from adaptune._system.files import DAMAGED_NPZ, entries
 from adaptune.errors import Finding, NotInstalledError
-from adaptune.files import DAMAGED_NPZ, entries
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
 from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
@@ -243,7 +244,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 # Times in the names of files: a date or a number, and what may come after it as a part of a second;
 # the power of ten that makes the number nanoseconds. Short ones count from 1970.
 _DATE = r"(?:^|\D)((?:19|20)\d\d(?:[-_.]?\d\d){2}[-_.T ]?\d\d(?:[-_.:hm]?\d\d){2})"
-_NAMES = (
+_STAMPED_NAMES = (
     (_DATE + r"([._,-]?(?:\d{3}){1,3}|\.\d+|)\D*$", None, "dates in UTC"),
     (r"^(\d{1,10})(\.\d+)$", 9, "seconds"),
     (r"(?:^|\D)([1-4]\d{9})([._-]\d{1,9})\D*$", 9, "seconds and their parts"),
@@ -257,7 +258,7 @@ _NAMES = (
 def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]:
     """Nanoseconds that the files' names are, and their unit, or a name that only looks like one."""
     stems = [re.sub(r"(\.(bin|npy|pcd|ply))+$", "", path.name) for path in files]
-    for pattern, power, unit in _NAMES:
+    for pattern, power, unit in _STAMPED_NAMES:
         found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]
         if len(found) < len(stems):
             continue

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from adaptune import files, yaml12
+from adaptune._system import files, yaml12
+from adaptune._system.progress import Progress, unseen
 from adaptune.errors import AdaptuneError, Finding, MachineError
-from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import (
     IMU_TYPES,
@@ -161,13 +161,13 @@ def _inspect_poses(path: Path) -> Inspection:
     return found
 
 
-_FILES = 40  # scan files that are read, unless all are to be
+_SCAN_FILES = 40  # scan files that are read, unless all are to be
 
 
 def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
     source = kitti(path) if kind == "kitti" else scan_folder(path)
     frames = list(source.frames())
-    number = len(frames) if deep else min(_FILES, len(frames))
+    number = len(frames) if deep else min(_SCAN_FILES, len(frames))
     topic = Topic(str(path), "scans", len(frames), n_read=number)
     topic.stamps = [[frame.stamp for frame in frames]]
     found = Inspection(path, {kind: str(path)}, {topic.name: topic}, {"points": topic.name})

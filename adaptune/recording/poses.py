@@ -13,16 +13,16 @@ _JUMP = 0.2
 """Metres; a radian counts as one. Smaller steps than that are noise."""
 _ACCELERATION = 10.0  # metres per second squared of a robot, or of the hand that holds a sensor
 _STAMPS = 0.5, 0.05  # share of a usual step, and seconds, by which stamps may be wrong
-_NOISE = 8.0  # times the median difference from neighbours: no noise is as large
-_MANY = 0.1  # share of the poses; where more go to and fro, no stretch between is right
+_NOISE_TIMES = 8.0  # times the median difference from neighbours: no noise is as large
+_MANY = 0.1  # share of the poses; where more go to and fro, no segment between is right
 _HELD, _AS_FAST = 0.02, 0.6
 """Metres that a robot moves at least while its pose is repeated, and the share of its usual speed
 at which the next pose makes up for it."""
-_PERIOD = 40_000_000  # nanoseconds; of poses that follow each other faster, some are enough
+_POSE_PERIOD = 40_000_000  # nanoseconds; of poses that follow each other faster, some are enough
 _AROUND = 5  # steps before, and after, that say how the robot moves
 _ANGLES = ("degrees", 180.0, 1.11e5), ("radians", np.pi, 6.37e6)
 """Units of longitude and latitude, the largest of them, and metres of one on the ground."""
-_SAID = 3  # stretches that are told one by one
+_SAID = 3  # segments that are told one by one
 
 
 def sound(
@@ -120,8 +120,8 @@ def _repeated(reference: Trajectory) -> NDArray[np.bool_]:
         return np.asarray(metres / np.maximum((at[other] - at[one]) * 1e-9, 1e-3))
 
     # Over some poses: the noise of each would count for motion.
-    before = np.minimum(np.searchsorted(at, at[start] - _AROUND * _PERIOD), start - 1).clip(0)
-    after = np.maximum(np.searchsorted(at, at[end] + _AROUND * _PERIOD), end + 1)
+    before = np.minimum(np.searchsorted(at, at[start] - _AROUND * _POSE_PERIOD), start - 1).clip(0)
+    after = np.maximum(np.searchsorted(at, at[end] + _AROUND * _POSE_PERIOD), end + 1)
     usual = np.maximum(speed(before, start), speed(end, after.clip(max=len(at) - 1)))
     seconds = (stamps[first[end] - 1] - at[start]) * 1e-9
     held = (usual * seconds > _HELD) & (speed(start, end) > _AS_FAST * usual)
@@ -140,7 +140,7 @@ def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
     """Stamps around steps that nothing explains, (n, 2), and how far the farthest leads."""
     from scipy.spatial.transform import Rotation
 
-    _, some = np.unique((reference.stamps - reference.stamps[0]) // _PERIOD, return_index=True)
+    _, some = np.unique((reference.stamps - reference.stamps[0]) // _POSE_PERIOD, return_index=True)
     if len(some) < 2:
         return np.empty((0, 2), np.int64), 0.0
     stamps, T = reference.stamps[some], geometry.steps(reference.T_world_sensor[some])
@@ -151,7 +151,9 @@ def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
     speed = np.linalg.norm(around, axis=2).max(axis=0)
     share, late = _STAMPS
     explained = np.maximum(_ACCELERATION * seconds**2, speed * np.maximum(share * seconds, late))
-    jumps = departure > np.maximum(explained, max(_JUMP, _NOISE * float(np.median(departure))))
+    jumps = departure > np.maximum(
+        explained, max(_JUMP, _NOISE_TIMES * float(np.median(departure)))
+    )
     jumps |= np.linalg.norm(T[:, :3, 3], axis=1) > FASTEST * seconds
     far = np.linalg.norm(steps[jumps], axis=1).max(initial=0.0)
     return np.column_stack([stamps[:-1], stamps[1:]])[jumps], float(far)

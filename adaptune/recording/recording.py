@@ -123,7 +123,7 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
         )
 
 
-_BEFORE = 3.0
+_SECONDS_BEFORE = 3.0
 """Seconds by which reading from a stamp on begins earlier: that of a message may mark the end of a
 scan, and what is seen of a scan may depend on those before."""
 _MOST_SCANS = 600  # at most so many scans are registered to find a clock offset
@@ -181,7 +181,7 @@ class RecordedSequence:
 
     def since(self, stamp: int) -> Iterator[Scan]:
         """Read the scans from a little before `stamp` on, without a word about what is odd."""
-        return self._carrying(self._scans_since(stamp - round(_BEFORE * 1e9)))
+        return self._carrying(self._scans_since(stamp - round(_SECONDS_BEFORE * 1e9)))
 
     def _carrying(self, scans: Iterator[Scan]) -> Iterator[Scan]:
         yield from carry_imu(scans, self._measured, self.name) if self._with_imu else scans

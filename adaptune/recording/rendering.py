@@ -87,7 +87,7 @@ def _scan_text(scan: Scan) -> str:
 
 def _reference_text(reference: Trajectory, complete: bool) -> str:
     length = travelled(reference.T_world_sensor)[-1]
-    seconds = (reference.stamps[-1] - reference.stamps[0]) * 1e-9
+    seconds = reference.seconds[-1]
     words = "poses, " if complete else "poses in the sample, at least "
     # Poses without stamps are numbered by nanoseconds.
     lasted = f" in {seconds:.1f} s" if seconds > 1e-3 else ""

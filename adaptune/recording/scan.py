@@ -174,9 +174,9 @@ class Recording(Protocol):
         """Measurements of the IMU, if there is one."""
 
 
-def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Number stretches of all recordings from 0 on, by place and stretch of each frame: (n,)."""
-    _, number = np.unique(np.stack([place, stretch], axis=1), axis=0, return_inverse=True)
+def segment_numbers(place: NDArray[np.intp], segment: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Number segments of all recordings from 0 on, by place and segment of each frame: (n,)."""
+    _, number = np.unique(np.stack([place, segment], axis=1), axis=0, return_inverse=True)
     return np.asarray(number.ravel())
 
 

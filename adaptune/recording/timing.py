@@ -15,14 +15,16 @@ TIME_FIELDS = ("time", "t", "timestamp", "timestamps", "time_stamp", "offset_tim
 
 Mark = Literal["auto", "start", "end", "first_point", "sensor_clock"]
 Unit = Literal["s", "ms", "us", "ns", "turn", "none"]
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAVE_OUT = "no `time_unit` mends them: write `time_unit: none` to leave the times out"
 
 # A turn of a spinning LiDAR takes 0.05 to 0.2 s, a frame of the slowest accumulating ones 1 s.
-_LONGEST = 10.0
+_LONGEST_SCAN = 10.0
 # A header and its points are on the same clock if they are no further apart than this.
 _SAME_CLOCK = 10.0
-_AGREE = 0.1  # times below a day or so are absolute, too, if they agree with the header to this
+_SAME_SECONDS = (
+    0.1  # times below a day or so are absolute, too, if they agree with the header to this
+)
 
 
 class TimingError(AdaptuneError):
@@ -31,7 +33,7 @@ class TimingError(AdaptuneError):
 
 def unit_of(span: float, least: float, most: float) -> str | None:
     """Unit in which a span as the driver wrote it takes from `least` to `most` seconds, if any."""
-    return next((u for u, scale in _SECONDS.items() if least < span * scale < most), None)
+    return next((u for u, scale in _UNITS.items() if least < span * scale < most), None)
 
 
 @dataclass(frozen=True)
@@ -88,14 +90,14 @@ class Timing:
         # Seconds from the stamp to the first point, or from the last one to the stamp.
         away = max(low, -high, 0) * scale
         reach = max(abs(low), abs(high)) * scale
-        if not span <= _LONGEST:
+        if not span <= _LONGEST_SCAN:
             what, unit = f"span {span:g} s", unit_of(high - low, 2e-3, 2.0)
             help_ = LEAVE_OUT if absolute or unit is None else f"write `time_unit: {unit}`"
         elif absolute or self.stamp == "first_point":
             return
         elif self.stamp == "sensor_clock":
             what, help_ = "are not absolute", "leave `stamp: sensor_clock` out"
-        elif reach > _LONGEST or away > max(1.0, 2.0 * span):
+        elif reach > _LONGEST_SCAN or away > max(1.0, 2.0 * span):
             what = f"begin {low * scale:g} s after their scan's stamp: they are on another clock"
             help_ = "write `stamp: first_point` to count them from the first point of each scan"
         else:
@@ -130,8 +132,8 @@ class Timing:
         high = extent[1]
         if self.unit == "turn":
             return self.period, False
-        given = None if self.unit is None else _SECONDS[self.unit]
-        for scale in _SECONDS.values() if given is None else (given,):
+        given = None if self.unit is None else _UNITS[self.unit]
+        for scale in _UNITS.values() if given is None else (given,):
             if _agree(stamp * 1e-9, extent, scale):
                 return scale, True
         if given is not None:
@@ -153,9 +155,9 @@ def _nanoseconds(value: float, scale: float) -> int:
 def _agree(stamp: float, extent: tuple[float, float], scale: float) -> bool:
     """Whether the first or the last time is the stamp, in seconds, and not a short one."""
     low, high = (end * scale for end in extent)
-    if 2.0 * low <= high - low or low < 0.5 * stamp or high - low > _LONGEST:
+    if 2.0 * low <= high - low or low < 0.5 * stamp or high - low > _LONGEST_SCAN:
         return False
-    return min(abs(low - stamp), abs(high - stamp)) <= _AGREE
+    return min(abs(low - stamp), abs(high - stamp)) <= _SAME_SECONDS
 
 
 def _unwrapped(
@@ -167,7 +169,7 @@ def _unwrapped(
     """
     (low, high), size = extent, values.dtype.itemsize
     unsigned = values.dtype.kind == "u" and size >= 4
-    turns = [2 ** (8 * size)] if unsigned else [2**32 * 1e-9 / s for s in _SECONDS.values()]
+    turns = [2 ** (8 * size)] if unsigned else [2**32 * 1e-9 / s for s in _UNITS.values()]
     # All may be below zero; but a simulator's clock may be as small as four bytes.
     below = unsigned and size == 4 and low > 0.9 * 2**32 and stamp > 10**10
     for turn in (t for t in turns if below or 0.5 * t < high - low < 1.001 * t):

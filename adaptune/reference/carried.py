@@ -19,7 +19,7 @@ from adaptune.trajectory import Trajectory
 _NEAR, _FAR = 1.0, 2.5  # metres that the reference moves between two scans that are compared
 _STANDS = 0.1  # by which share of them, and radians, scans that stand seem to move at most
 _FEWEST, _SHORTEST = 2, 2_000_000_000  # comparisons in a row, and nanoseconds, from which it counts
-_PAUSE = 1_000_000_000  # nanoseconds to the next comparison where the scans move
+_COMPARISON_PERIOD = 1_000_000_000  # nanoseconds to the next comparison where the scans move
 
 
 class _Pair(NamedTuple):
@@ -43,7 +43,9 @@ class Carried:
         here = scan.stamp, T_ref_sensor, HopCloud(scan, np.eye(4), 0.0)
         before, pairs = self._before, self._pairs
         if before is None or np.isnan(T_ref_sensor).any():
-            rests = pairs and not pairs[-1].stands and scan.stamp < pairs[-1].end + _PAUSE
+            rests = (
+                pairs and not pairs[-1].stands and scan.stamp < pairs[-1].end + _COMPARISON_PERIOD
+            )
             self._before = None if rests or np.isnan(T_ref_sensor).any() else here
             return
         T = invert(before[1]) @ T_ref_sensor
@@ -51,14 +53,14 @@ class Carried:
         if _NEAR <= metres <= _FAR:
             pairs.append(_Pair(before[0], scan.stamp, metres, *_compared(before[2], here[2], T)))
             self._before = here if pairs[-1].stands else None
-        elif metres > _FAR or (metres < _STANDS and scan.stamp > before[0] + _PAUSE):
+        elif metres > _FAR or (metres < _STANDS and scan.stamp > before[0] + _COMPARISON_PERIOD):
             hop = register(before[2], here[2], [T]) if metres < _STANDS else None
             if hop is not None and np.linalg.norm(hop.T_start_end[:3, 3]) > 0.5 * _NEAR:
                 self._alone = True
             self._before = here
 
     def findings(self, begin: int) -> list[Finding]:
-        """The stretches, whose poses do not count; seconds from `begin`, in nanoseconds, on."""
+        """The segments, whose poses do not count; seconds from `begin`, in nanoseconds, on."""
         pairs, found = self._pairs, []
         stand = np.array([False, *(pair.stands for pair in pairs), False])
         agree = sum(pair.agrees for pair in pairs)
@@ -94,7 +96,7 @@ def _compared(start: HopCloud, end: HopCloud, T_start_end: Poses) -> tuple[bool,
 def left_out(
     stamps: NDArray[np.int64], findings: Iterable[Finding], begin: int
 ) -> NDArray[np.bool_]:
-    """Which stamps lie in the stretches that findings name, of shape (n,)."""
+    """Which stamps lie in the segments that findings name, of shape (n,)."""
     seconds, lost = (stamps - begin) * 1e-9, np.zeros(len(stamps), bool)
     for start, end in (finding.seconds for finding in findings if finding.seconds is not None):
         lost |= (seconds >= start) & (seconds <= end)
@@ -102,7 +104,7 @@ def left_out(
 
 
 def without(reference: Trajectory, findings: Sequence[Finding], begin: int) -> Trajectory:
-    """The reference, which is unknown in these stretches."""
+    """The reference, which is unknown in these segments."""
     if not (lost := left_out(reference.stamps, findings, begin)).any():
         return reference
     gaps = (f.seconds[1] - f.seconds[0] for f in findings if f.seconds is not None)

@@ -36,7 +36,7 @@ class MeasuredReference:
     T_ref_sensor: Poses  # (n, 4, 4): poses of the reference; NaN where there is none
     hops: Hops  # direct registrations of the same scans
     doubt: str = ""  # why registrations of these scans prove nothing, see `hard_to_track`
-    carried: Sequence[Finding] = ()  # stretches that are left out, see `adaptune.reference.carried`
+    carried: Sequence[Finding] = ()  # segments that are left out, see `adaptune.reference.carried`
 
     def error(self, length: float) -> OwnError | None:
         """Mean error of the reference, in percent of sub-trajectories of `length` metres.
@@ -165,7 +165,7 @@ the noise of the reference counts too much."""
 LONGER = (5.0, 10.0, 25.0, 50.0, 100.0)
 """Metres to choose from where the first of `LENGTHS` that fits is too short after all."""
 FEWEST = 1.4  # how many of them the path of the test must hold then
-SECONDS = 2.0
+LEAST_SECONDS = 2.0
 """A sub-trajectory lasts as long at least, up to the greatest of `LENGTHS`: who is fast often has
 a reference of GPS, which is noisy."""
 NOISY = 0.5  # percent by which a reference may be wrong, as far as registrations can tell
@@ -193,13 +193,13 @@ def proposed_sub_trajectory(
     """Metres of the sub-trajectories that a study should judge by.
 
     The first of `LENGTHS` for which the path after the share `training` of the time is long enough,
-    1 m if none is, or a longer one if that does not last `SECONDS`. Where registrations say that
-    the reference is too noisy for it, the first longer one that fits and for which it is not; where
-    it is for all, the longest that fits, up to the greatest of `LENGTHS`.
+    1 m if none is, or a longer one if that does not last `LEAST_SECONDS`. Where registrations say
+    that the reference is too noisy for it, the first longer one that fits and for which it is not;
+    where it is for all, the longest that fits, up to the greatest of `LENGTHS`.
     """
     path, seconds = path_after(reference, training)
     usual = next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)
-    least = min(SECONDS * path / seconds, max(LENGTHS)) if seconds else 0.0
+    least = min(LEAST_SECONDS * path / seconds, max(LENGTHS)) if seconds else 0.0
     fit = [usual, *(length for length in LONGER if length > usual and FEWEST * length <= path)]
     usual = next((length for length in fit if length >= least), fit[-1])
     if measured is None or not measured.is_noisy(usual):

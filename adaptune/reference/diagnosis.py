@@ -34,17 +34,17 @@ from adaptune.reference.carried import Carried, begin_of, without
 from adaptune.reference.check import CONTRADICTS, NOISY, pose_at
 from adaptune.trajectory import Trajectory
 
-_STRETCHES, _SCANS = 4, 40
-"""Stretches of a recording that are looked at, evenly spread, and the scans of each."""
+_SEGMENTS, _SCANS = 4, 40
+"""Segments of a recording that are looked at, evenly spread, and the scans of each."""
 _METRES, _EACH = 4.0, 4
-"""A motion is measured over so many metres, or over half a stretch if that is less, and begins at
+"""A motion is measured over so many metres, or over half a segment if that is less, and begins at
 every fourth scan of it."""
-_NEAR = 0.6, 0.1, 0.5
+_NEIGHBOURS = 0.6, 0.1, 0.5
 """Metres, radians and seconds between neighbours, below which scans in between are left out."""
 _STANDING = 0.5  # metres below which a motion is noise
-_ENOUGH = 10.0  # metres after which the rest of a stretch is not looked at
-_MOTIONS = 12  # motions after which no more are measured, an equal share of them in each stretch
-_AGREE = 0.3  # metres by which two ways of registering the same scans may differ
+_ENOUGH = 10.0  # metres after which the rest of a segment is not looked at
+_MOTIONS = 12  # motions after which no more are measured, an equal share of them in each segment
+_SAME_METRES = 0.3  # metres by which two ways of registering the same scans may differ
 
 
 def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:
@@ -53,36 +53,36 @@ def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:
     Neighbours are registered one after the other, then scans some metres apart directly, which owes
     nothing to any poses. There is nothing where both ways end apart, as where the view is narrow.
     """
-    n_stretches = min(_STRETCHES, max(n_scans // _SCANS, 1))
-    begins = np.linspace(0, max(n_scans - _SCANS, 0), n_stretches).astype(int)
+    n_segments = min(_SEGMENTS, max(n_scans // _SCANS, 1))
+    begins = np.linspace(0, max(n_scans - _SCANS, 0), n_segments).astype(int)
     scans, position = iter(scans), 0
     found: list[tuple[int, int, Hop]] = []
     for begin in begins.tolist():
-        stretch = list(islice(scans, begin - position, begin - position + _SCANS))
+        segment = list(islice(scans, begin - position, begin - position + _SCANS))
         position = begin + _SCANS
-        some = islice(_motions_over(stretch), -(-_MOTIONS // n_stretches))
+        some = islice(_motions_over(segment), -(-_MOTIONS // n_segments))
         found += [(begin + i, begin + k, hop) for i, k, hop in some]
     return Hops.of(found)
 
 
-def _stride(stretch: list[Scan]) -> int:
+def _stride(segment: list[Scan]) -> int:
     """Which scans are enough where the sensor moves slowly: every one, second or fourth."""
-    *_, (_, T, seconds) = neighbour_motions(stretch[:2])
+    *_, (_, T, seconds) = neighbour_motions(segment[:2])
     T = np.full((4, 4), np.nan) if T is None else T
     moved = np.array([np.linalg.norm(T[:3, 3]), rotation_angle(T), seconds])
-    return max(n for n in (1, 2, _EACH) if n == 1 or (n * moved < _NEAR).all())
+    return max(n for n in (1, 2, _EACH) if n == 1 or (n * moved < _NEIGHBOURS).all())
 
 
-def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
-    """Numbers of two scans of a stretch, and the registration of one to the other."""
-    if len(stretch) < 2:
+def _motions_over(segment: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
+    """Numbers of two scans of a segment, and the registration of one to the other."""
+    if len(segment) < 2:
         return
-    stride = _stride(stretch)
-    stretch = stretch[::stride]
+    stride = _stride(segment)
+    segment = segment[::stride]
     T: list[Poses] = []
     clouds: list[HopCloud] = []
     start = 0
-    for i, (scan, step, seconds) in enumerate(neighbour_motions(stretch)):
+    for i, (scan, step, seconds) in enumerate(neighbour_motions(segment)):
         if i and step is None:
             break
         T.append(np.eye(4) if step is None else T[-1] @ step)
@@ -99,7 +99,7 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
             given = [guess] if metres >= _STANDING else []
             if (hop := register(*ends, given, reaches=OFFLINE_REACHES)) is not None:
                 difference = hop.projection @ (hop.T_start_end - guess)[:3, 3]
-                if np.linalg.norm(difference) < _AGREE:
+                if np.linalg.norm(difference) < _SAME_METRES:
                     yield start * stride, i * stride, hop
             start += _EACH // stride
         if np.linalg.norm(T[i][:3, 3]) > _ENOUGH:
@@ -115,7 +115,7 @@ UNITS, UNLIKE = (10.0, 100.0, 1000.0, 1.0 / 0.3048), 0.05
 SAME = 0.01  # share of a way or a turn, and radians, that count as none
 FEWEST_HOPS = 5  # measured motions that a verdict needs
 TRUSTED = 0.8  # share of the measured motions that are right at least, those that fit best
-CLOCK = 30.0  # seconds by which clocks may differ to be found
+CLOCK_OFFSET = 30.0  # seconds by which clocks may differ to be found
 FAR_APART = 0.25  # seconds between poses, from which on the way between them is not straight
 TURNED = 0.1
 """Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
@@ -335,7 +335,7 @@ def _clock(
         return float(np.minimum(shares[known], 1.0).mean()) if known.mean() > 0.5 else np.inf
 
     step = float(np.clip(0.2 * np.median(seconds), 0.05, 0.5))
-    offsets = np.arange(-CLOCK, CLOCK + step / 2, step)
+    offsets = np.arange(-CLOCK_OFFSET, CLOCK_OFFSET + step / 2, step)
     costs = np.array([unlike(offset) for offset in offsets])
     if not np.isfinite(costs).any():
         return
@@ -475,7 +475,7 @@ def contradictions(
 ) -> Iterator[Finding]:
     """What scans say where a reference and an odometry differ by `error` percent, if that is large.
 
-    Stretches on which the scans stand still while the reference moves come first. The odometry's
+    Segments on which the scans stand still while the reference moves come first. The odometry's
     poses, of shape (n_scans, 4, 4), owe nothing to the reference, and are those of the scans with
     the stamps `seen`, or of all. `place` is as in `diagnose_reference`; `given` says whether the
     reference came with the recording.

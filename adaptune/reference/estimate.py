@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptune._system.machine import pin
 from adaptune.bank.members import LEVER
 from adaptune.errors import import_extra
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
-from adaptune.machine import pin
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.scan import Recording, Scan
@@ -38,7 +38,7 @@ MOST_UNKNOWN = 0.5  # share of the scans whose pose may be unknown
 _AGREES = (0.1, 0.02)
 """A registration agrees with the graph within so many metres and this share of its length."""
 _LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]  # metres from which on scans may have too little in common
-_NEAR = 0.1
+_HALF_WEIGHT = 0.1
 """Metres within which a member's motion from scan to scan counts for a half of the reference."""
 
 Advance = Callable[[int, int], None]
@@ -230,7 +230,7 @@ def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Pos
     theirs = found.T_previous_current[1:, list(members)]
     distance = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)
     distance += LEVER * rotation_angle(invert(whole) @ theirs)
-    near = distance <= _NEAR
+    near = distance <= _HALF_WEIGHT
     near |= ~near.any(axis=1, keepdims=True)
     theirs = np.where(np.isfinite(distance)[..., None, None], theirs, whole)
     return mean_motion(theirs, near.astype(np.float64))

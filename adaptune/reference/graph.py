@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune._system.forking import processes
 from adaptune.bank.bank import Bank
-from adaptune.forking import processes
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hops import NEW_GUESS, OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, register
 from adaptune.metrics import travelled
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.registry import odometry_class
-from adaptune.odometry.tracker import WARM_UP, Tracker
+from adaptune.odometry.tracker import RESTART_WARM_UP, Tracker
 from adaptune.recording.scan import Scan, read_ahead
 from adaptune.space import ParameterSet, Selection
 
@@ -51,10 +51,12 @@ class Consensus:
         def make(parameters: Mapping[str, Any]) -> InProcess:
             kind, given = POOL[int(parameters["number"])]
             cls: Any = odometry_class(kind)
-            return InProcess(cls(dict(given), cls.settings_type(downsampling=_DOWNSAMPLING)))
+            made = InProcess(cls(dict(given), cls.settings_type(downsampling=_DOWNSAMPLING)))
+            made.warm_up = RESTART_WARM_UP  # on open ground, that is better than none
+            return made
 
         sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
-        self._bank = Bank(make, sets, WARM_UP)
+        self._bank = Bank(make, sets)
         even = dict.fromkeys(sets, 1.0)
         self._bank.apply(Selection(trial=0, parameters={}, weights=even))
         self._tracker = Tracker(self._bank, HealthCheck())
@@ -113,7 +115,7 @@ class _Anchor(NamedTuple):
     T_odom_sensor: Poses  # (1 + n_members, 4, 4): of the consensus, then of its members
 
 
-_AHEAD = 8
+_SCANS_AHEAD = 8
 """Scans by which the consensus may be ahead of what is registered directly, and behind those that
 are read: most bags are packed."""
 
@@ -130,13 +132,13 @@ def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: 
     motions: list[Poses] = []
     waiting: deque[Future[None]] = deque()
     with processes(1, [__name__]) as beside:
-        for scan in read_ahead(scans, _AHEAD):
+        for scan in read_ahead(scans, _SCANS_AHEAD):
             T_odom_sensor, T_previous_current = consensus.register(scan)
             waiting.append(beside.submit(_add, scan, T_odom_sensor, T_previous_current))
             stamps.append(scan.stamp)
             poses.append(T_odom_sensor)
             motions.append(T_previous_current)
-            if len(waiting) > _AHEAD:
+            if len(waiting) > _SCANS_AHEAD:
                 waiting.popleft().result()
             advance(len(stamps))
         for one in waiting:
@@ -260,7 +262,7 @@ def _metres_apart(T: Poses, other: Poses) -> float:
 
 _OF_A_STEP = (0.005, 0.002)
 """Metres and radians by which the motion from scan to scan is wrong, about, if it is small."""
-_SHARE = (0.05, 0.02)  # what each metre adds to the metres, and each radian to the radians
+_NOISE_SHARE = (0.05, 0.02)  # what each metre adds to the metres, and each radian to the radians
 _OF_A_HOP = (0.02, 0.003)
 """Metres and radians by which a registration over `_LONG` metres is wrong, about."""
 _LONG = LENGTHS[-1]
@@ -270,7 +272,7 @@ what they get wrong alike adds up: on open ground, the rings of the laser on the
 towards no motion. So they count as more wrong: in metres as the way is shorter, in radians as its
 square root."""
 _UNKNOWN = 10.0  # metres by which a registration is wrong along a direction that it does not tell
-_ITERATIONS = 50
+_SOLVER_ITERATIONS = 50
 
 
 class Edge(NamedTuple):
@@ -296,8 +298,8 @@ def optimised(
     for i, T in enumerate(T_odom_sensor if T_first_guess is None else T_first_guess):
         values.insert(i, gtsam.Pose3(T))
     motions = steps(T_odom_sensor)
-    metres = _OF_A_STEP[0] + _SHARE[0] * np.linalg.norm(motions[:, :3, 3], axis=1)
-    radians = _OF_A_STEP[1] + _SHARE[1] * rotation_angle(motions)
+    metres = _OF_A_STEP[0] + _NOISE_SHARE[0] * np.linalg.norm(motions[:, :3, 3], axis=1)
+    radians = _OF_A_STEP[1] + _NOISE_SHARE[1] * rotation_angle(motions)
     for i, T in enumerate(motions):
         noise = _sigmas(metres[i], radians[i])
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(T), _robust(noise)))
@@ -308,7 +310,7 @@ def optimised(
     first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
     options = gtsam.LevenbergMarquardtParams()
-    options.setMaxIterations(_ITERATIONS)
+    options.setMaxIterations(_SOLVER_ITERATIONS)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
     T = np.array([found.atPose3(i).matrix() for i in range(len(T_odom_sensor))])
     return np.asarray(rectify(invert(T[0]) @ T))

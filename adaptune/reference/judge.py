@@ -77,7 +77,7 @@ class Reference(NamedTuple):
         return 1 if self.trajectory is None else span(self.trajectory.T_world_sensor, self.length)
 
     def errors(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Capped sub-trajectory RTE at every frame in percent, NaN where it is unknown."""
+        """Clipped sub-trajectory RTE at every frame in percent, NaN where it is unknown."""
         if self.trajectory is None:
             return np.full(len(odometry), np.nan)
         T_ref_sensor = self.trajectory.at(odometry.stamps)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.files import DAMAGED_NPZ, replacing, write_text
+from adaptune._system.files import DAMAGED_NPZ, replacing, write_text
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.report.charts import Axis, Chart, Drawn, Line, Panel, Points, Spans
 from adaptune.report.drawing import draw_chart

@@ -61,7 +61,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Spans:
-    """Stretches along x that are shaded and named, such as the scenes of a course."""
+    """Segments along x that are shaded and named, such as the scenes of a course."""
 
     edges: Values  # of shape (n + 1,)
     names: tuple[str, ...]  # of shape (n,); an empty name is not shaded
@@ -125,12 +125,12 @@ def chart_rows(chart: Chart) -> list[dict[str, Any]]:
             about |= {"x axis": panel.x.label, "y axis": panel.y.label}
             for values in zip(*columns.values(), strict=True):
                 of_point = about | dict(zip(columns, values, strict=True))
-                rows.append({key: of_point.get(key) for key in _COLUMNS})
+                rows.append({key: of_point.get(key) for key in _CSV_COLUMNS})
     return rows
 
 
 _PARTS = {key: key.removesuffix("s") for key in ("x", "y", "low", "high", "colour", "texts")}
-_COLUMNS = ("panel", "name", *_PARTS.values(), "x axis", "y axis")
+_CSV_COLUMNS = ("panel", "name", *_PARTS.values(), "x axis", "y axis")
 """Of `chart_rows`."""
 Charts = Iterator[Chart | str | None]
 """Charts of a part of a study; of what is missing, a sentence that says what to run, or None."""

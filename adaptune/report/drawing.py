@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.files import replacing
+from adaptune._system.files import replacing
 from adaptune.report.charts import (
     Axis,
     Band,
@@ -30,7 +30,7 @@ from adaptune.report.tables import csv_text
 
 _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
 """A colour map whose lightness rises, without colours too light for a white ground."""
-_MOST = 1500
+_MOST_POINTS = 1500
 """Most points of a line that are drawn."""
 _MANY, _OUTLINED = 1000, 150
 """Points from which on they are small, and up to which they have outlines."""
@@ -56,13 +56,13 @@ def numbers(values: Values, axis: Axis) -> NDArray[np.float64]:
 def thinned(*columns: NDArray[np.float64]) -> NDArray[np.intp]:
     """Indices of the points of a line to draw where it has many.
 
-    Of each stretch the lowest and the highest of every column stay, and a gap stays a gap.
+    Of each segment the lowest and the highest of every column stay, and a gap stays a gap.
     """
     n = len(columns[0])
-    if n <= _MOST:
+    if n <= _MOST_POINTS:
         return np.arange(n)
     kept = [0, n - 1]
-    for some in np.array_split(np.arange(n), _MOST // (2 * len(columns) + 2)):
+    for some in np.array_split(np.arange(n), _MOST_POINTS // (2 * len(columns) + 2)):
         missing = np.isnan([column[some] for column in columns]).any(axis=0)
         kept += [some[0], some[missing.argmax()]]
         there = some[~missing]
@@ -366,7 +366,7 @@ class _Drawing:
             yield {"data": _table(x=[begin], x2=[end]), "mark": mark, "encoding": encoding}
 
     def _span_names(self, spans: Spans) -> Iterator[Spec]:
-        """The names of stretches above them, or turned where they are short."""
+        """The names of segments above them, or turned where they are short."""
         low, high = self._extent["x"]
         for begin, end, name in _shaded(spans):
             pixels, needed = (end - begin) / (high - low) * self._size["x"], _LETTER * len(name)
@@ -408,7 +408,7 @@ _DRAW: dict[type, Callable[[_Drawing, Any], Iterator[Spec]]] = {
 
 
 def _shaded(spans: Spans) -> list[tuple[float, float, str]]:
-    """Begin, end and name of each stretch that is shaded."""
+    """Begin, end and name of each segment that is shaded."""
     edges = np.asarray(spans.edges, float).tolist()
     every = zip(edges[:-1], edges[1:], spans.names, strict=True)
     return [span for span in every if span[2]]

@@ -7,8 +7,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from adaptune.files import write_text
-from adaptune.forking import processes
+from adaptune._system.files import write_text
+from adaptune._system.forking import processes
 from adaptune.report.charts import Chart
 from adaptune.report.drawing import draw_chart, spec
 from adaptune.report.tables import Listing, cell_text

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from adaptune.files import write_text
+from adaptune._system.files import write_text
 
 _FEW, _MANY = 0.1, 10.0
 

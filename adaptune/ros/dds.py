@@ -41,7 +41,7 @@ _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _NEVER: Callable[[], bool] = lambda: False  # noqa: E731
-_ALL = core.ViewState.Any | core.SampleState.Any
+_ANY_STATE = core.ViewState.Any | core.SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
     for name in ("Volatile", "TransientLocal", "Transient", "Persistent")
@@ -89,7 +89,7 @@ class DdsLink:
             pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
             readers = [builtin.BuiltinDataReader(me, topic) for topic in pair]
             self._found = [
-                (r, core.ReadCondition(r, _ALL | core.InstanceState.Alive)) for r in readers
+                (r, core.ReadCondition(r, _ANY_STATE | core.InstanceState.Alive)) for r in readers
             ]
             self._kept: list[Any] = []
             self._writers: dict[str, DataWriter] = {}
@@ -153,7 +153,7 @@ class DdsLink:
         for condition in (
             reader,
             self._closing,
-            core.ReadCondition(reader, _ALL | core.InstanceState.Any),
+            core.ReadCondition(reader, _ANY_STATE | core.InstanceState.Any),
         ):
             ready.attach(condition)
         end, forever = time.monotonic() + seconds, seconds == np.inf

@@ -19,14 +19,14 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from adaptune import processes
+from adaptune._system import processes
 from adaptune.ros import ros1_node
 from adaptune.ros.link import BusyError, LinkError, take_all, telling
 from adaptune.ros.ros2 import BUFFER_CURE, RECEIVE_BUFFER, message_types
 
-_START = 20.0  # seconds in which the node must be ready
+_NODE_START = 20.0  # seconds in which the node must be ready
 _WAITING = 1000  # messages of a topic that may wait; more are dropped
-_ANSWER = 5.0  # seconds in which it must answer; it waits less for others
+_ANSWER_SECONDS = 5.0  # seconds in which it must answer; it waits less for others
 _DEAF = 30.0  # seconds in which it must read what is sent
 
 _log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class Relay:
         self._answers: dict[int, SimpleQueue[dict[str, Any]]] = {}
         self._takes: dict[str, Callable[[str, bytes], None]] = {}
         self._waiting: list[SimpleQueue[bytes | None]] = []
-        ready = processes.receive(self._stream) if self._stream.ready(_START) else None
+        ready = processes.receive(self._stream) if self._stream.ready(_NODE_START) else None
         if ready is None or ready.header["type"] == "failed":
             self.close()
             what = "its node did not start" if ready is None else ready.header["message"]
@@ -137,9 +137,9 @@ class Relay:
         waiting = self._answers[number] = SimpleQueue()
         try:
             self._send({**given, "type": kind, "number": number})
-            answer = waiting.get(timeout=_ANSWER)
+            answer = waiting.get(timeout=_ANSWER_SECONDS)
         except Empty as error:
-            raise BusyError(f"no answer in {_ANSWER:g} s") from error
+            raise BusyError(f"no answer in {_ANSWER_SECONDS:g} s") from error
         finally:
             del self._answers[number]
         if "refused" in answer:

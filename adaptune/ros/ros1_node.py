@@ -19,9 +19,14 @@ except ImportError:
     from xmlrpclib import ServerProxy  # type: ignore[no-redef]
 
 _LENGTH = struct.Struct("<I")
-_SECONDS = 2.0  # in which another node must answer
+_NODE_TIMEOUT = 2.0  # in which another node must answer
 _BUFFER = 1 << 24  # bytes
-_OWN = ("/adaptune", "/rosout", "/play_", "/record_")  # nodes that are no odometry, by their begin
+_OWN_NODES = (
+    "/adaptune",
+    "/rosout",
+    "/play_",
+    "/record_",
+)  # nodes that are no odometry, by their begin
 
 
 class Stream(object):
@@ -158,12 +163,12 @@ class _Node(object):
         listened = {}  # type: dict[str, list[str]]
         nodes = set()  # type: set[str]
         for topic, names in published + subscribed:
-            others = [name for name in names if not name.startswith(_OWN)]
+            others = [name for name in names if not name.startswith(_OWN_NODES)]
             nodes.update(others)
             if topic in header["topics"]:
                 self._watched.update(others)
         for topic, names in subscribed:
-            listened[topic] = [name for name in names if not name.startswith(_OWN)]
+            listened[topic] = [name for name in names if not name.startswith(_OWN_NODES)]
         dead = []
         for name in sorted(nodes | set(self._usage)):
             try:
@@ -193,9 +198,9 @@ class _Node(object):
     def _reconfigured(self, node, values):  # type: (str, dict[str, Any]) -> dict[str, Any]
         from dynamic_reconfigure.client import Client
 
-        client = Client(node, timeout=_SECONDS)
+        client = Client(node, timeout=_NODE_TIMEOUT)
         try:
-            known = client.get_configuration(timeout=_SECONDS) or {}
+            known = client.get_configuration(timeout=_NODE_TIMEOUT) or {}
             own = {name: name.replace(".", "/").rpartition("/")[2] for name in values}
             # Two parameters may end alike.
             last = list(own.values())

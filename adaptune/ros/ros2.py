@@ -38,7 +38,7 @@ PLACES = {
 """Where a node serves them, below its name."""
 FIELDS = {bool: "bool_value", int: "integer_value", float: "double_value", str: "string_value"}
 """Where a parameter's value is, in the order of rcl_interfaces/msg/ParameterType, from 1 on."""
-_ARRAYS = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
+_ARRAY_TYPES = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
 """The arrays that a parameter's value has besides, which stay empty."""
 
 
@@ -89,7 +89,7 @@ def parameter_message(store: Typestore, name: str, value: Any) -> Any:
     if type(plain) not in FIELDS:
         raise LinkError(f"{name} = {value!r} is not a boolean, a number or a text")
     fields: dict[str, Any] = {field: kind() for kind, field in FIELDS.items()}
-    fields |= {f"{name}_array_value": np.empty(0, kind) for name, kind in _ARRAYS.items()}
+    fields |= {f"{name}_array_value": np.empty(0, kind) for name, kind in _ARRAY_TYPES.items()}
     fields["string_array_value"] = []
     fields |= {"type": 1 + list(FIELDS).index(type(plain)), FIELDS[type(plain)]: plain}
     held = store.types["rcl_interfaces/msg/ParameterValue"](**fields)

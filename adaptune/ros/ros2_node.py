@@ -11,7 +11,7 @@ from adaptune.ros.link import LinkError
 from adaptune.ros.ros1_node import Stream, serve
 from adaptune.ros.ros2 import full
 
-_QUIET = ("/parameter_events", "/rosout", "/clock")  # topics of every node
+_COMMON_TOPICS = ("/parameter_events", "/rosout", "/clock")  # topics of every node
 
 
 class _Node:
@@ -44,7 +44,7 @@ class _Node:
         self._link.meet()
         return {
             "published": published,
-            "subscribed": {t: k for t, k in self._kinds(1).items() if t not in _QUIET},
+            "subscribed": {t: k for t, k in self._kinds(1).items() if t not in _COMMON_TOPICS},
             "sending": {topic: self._link.hearers(topic) for topic in self._publish},
             "senders": {t: [e.node for e in self._link.endpoints(0, t)] for t in header["own"]},
             "unheard": {topic: self._link.why_unheard(topic) for topic in header["topics"]},

@@ -64,7 +64,7 @@ class Steering:
     def _warn(self, name: str) -> None:
         if name not in self._warned_of:
             self._warned_of.add(name)
-            what = "%s: nobody says whether %s takes effect before the node starts again"
+            what = "%s does not report whether %s, which was set, applies before it starts again"
             _log.warning(what, self._node, name)
 
     def _set(self, command: Sequence[str], name: str, value: Any) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from adaptune import geometry
+from adaptune._system.strict import StrictModel
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.recording.config import Compensation, Part, SequenceConfig
@@ -21,7 +22,6 @@ from adaptune.simulation.open_ground import OPEN
 from adaptune.simulation.street import STREET
 from adaptune.simulation.tiles import Scene
 from adaptune.simulation.underground import CAVE, MINE
-from adaptune.strict import StrictModel
 
 SCENES: Mapping[str, Scene] = {
     "cave": CAVE,
@@ -199,13 +199,13 @@ T_IMU_LIDAR: Poses = np.array(
 )
 """Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
 
-NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)  # noise of an Xsens MTi-680G
+IMU_NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)  # noise of an Xsens MTi-680G
 
 
 def as_sequence(course: Course, path: Path) -> SequenceConfig:
     """Configuration of the sequence in the bag that was recorded of a course."""
     extrinsic = geometry.invert(T_IMU_LIDAR).tolist()
-    imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": NOISE._asdict()}
+    imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": IMU_NOISE._asdict()}
     return SequenceConfig(
         bag=str(path),
         points=POINTS,

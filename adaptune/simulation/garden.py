@@ -18,14 +18,14 @@ from adaptune.simulation.mesh import (
 )
 from adaptune.simulation.tiles import TILE, Floats, Scene, Spots, Tile, beyond, paved, strew
 
-_KINDS = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}
+_SCENERY = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}
 """Trees on a square metre of each kind of tile."""
 _BANK, _RIVER = -13.0, -30.0  # offsets of the river's near and far bank
 
 
 def _kind(index: int, seed: int) -> str:
-    number = np.random.default_rng([seed, 71, index + 1000]).integers(len(_KINDS))
-    return list(_KINDS)[number]
+    number = np.random.default_rng([seed, 71, index + 1000]).integers(len(_SCENERY))
+    return list(_SCENERY)[number]
 
 
 def _channel(spots: Spots, seed: int) -> Floats:
@@ -60,7 +60,7 @@ def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
 def _garden_build(tile: Tile) -> list[Mesh]:
     rng, kind = tile.rng, _kind(tile.index, tile.seed)
     near = 9.0 if kind == "clearing" else 3.2
-    s, d = _on_land(*tile.scatter(_KINDS[kind], near, 32.0, margin=4.0))
+    s, d = _on_land(*tile.scatter(_SCENERY[kind], near, 32.0, margin=4.0))
     meshes = [_trees(tile, s, d, (0.7, 1.3))]
     s, d = _on_land(*tile.scatter(0.02, 2.4, 14.0, margin=4.0))
     meshes.append(strew(tile, variants(bush), s, d, rng.uniform(0.4, 1.2, len(s))))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.compiled import compiled
+from adaptune._system.compiled import compiled
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

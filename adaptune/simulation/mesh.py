@@ -49,8 +49,8 @@ class Material(IntEnum):
 
 
 # Diffuse reflectivity of each material near 905 nm, indexed by `Material`.
-_SHARES = [0.25, 0.35, 0.15, 0.35, 0.30, 0.60, 0.40, 0.05, 0.50, 0.25, 0.45, 0.02, 0.45]
-REFLECTIVITY = np.array(_SHARES, np.float32)
+_REFLECTED = [0.25, 0.35, 0.15, 0.35, 0.30, 0.60, 0.40, 0.05, 0.50, 0.25, 0.45, 0.02, 0.45]
+REFLECTIVITY = np.array(_REFLECTED, np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,17 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry, open3d
-from adaptune.files import replacing, write_text
+from adaptune import geometry
+from adaptune._system import open3d
+from adaptune._system.files import replacing, write_text
+from adaptune._system.progress import Progress, unseen
 from adaptune.geometry import Poses, invert
-from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages, measurements, structured
 from adaptune.recording.scan import Imu, Scan
 from adaptune.simulation import kernels
 from adaptune.simulation.course import (
     IMU,
+    IMU_NOISE,
     MOTIONS,
-    NOISE,
     POINTS,
     POSES,
     SCENES,
@@ -177,8 +178,8 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
         bias = bias + np.cumsum(rng.normal(0.0, walk / np.sqrt(rate), shape), axis=0)
         return np.asarray(bias + rng.normal(0.0, noise * np.sqrt(rate), shape))
 
-    gyro = gyro + error(2e-3, NOISE.gyroscope_walk, NOISE.gyroscope)
-    return gyro, accel + error(2e-2, NOISE.accelerometer_walk, NOISE.accelerometer)
+    gyro = gyro + error(2e-3, IMU_NOISE.gyroscope_walk, IMU_NOISE.gyroscope)
+    return gyro, accel + error(2e-2, IMU_NOISE.accelerometer_walk, IMU_NOISE.accelerometer)
 
 
 _GEOMETRY = ("Point", "Quaternion", "Pose", "PoseStamped")

@@ -59,7 +59,7 @@ def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     lean = 0.9 * room * fractal(along, 7.0, seed + 23).reshape(s.shape)
     chamber = room * _chambers(s, angle, seed)
     d, z = (half + chamber) * np.cos(angle), roof * np.sin(angle)
-    # Metre-scale bumps make each stretch of wall distinct; a robot fits through.
+    # Metre-scale bumps make each segment of wall distinct; a robot fits through.
     places = np.stack(np.broadcast_arrays(s, d, z), axis=-1).reshape(-1, 3)
     bumps = fractal(places, 2.6, seed + 24, 2).reshape(d.shape) * (0.12 + 0.68 * room)
     return lean + d + bumps * np.cos(angle), z + bumps * np.sin(angle)

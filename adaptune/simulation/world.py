@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Leg:
-    """A stretch of road through one scene, between two stations in metres."""
+    """A segment of road through one scene, between two stations in metres."""
 
     scene: Scene
     start: float
@@ -128,15 +128,15 @@ def _bends(
     return np.asarray(PchipInterpolator(nodes, values)(stations), np.float64)
 
 
-_CELL = 0.7  # metres between vertices of the ground near the road
+_GROUND_CELL = 0.7  # metres between vertices of the ground near the road
 _GROUND = 115.0  # metres of ground on either side of the road
 
 
 def _offsets() -> NDArray[np.float64]:
     """Lay the ground's vertices across the road: dense near it, ever sparser beyond."""
-    offsets = list(np.arange(0.0, 9.0, _CELL))
+    offsets = list(np.arange(0.0, 9.0, _GROUND_CELL))
     while offsets[-1] < _GROUND:
-        offsets.append(offsets[-1] + max(_CELL, 0.09 * offsets[-1]))
+        offsets.append(offsets[-1] + max(_GROUND_CELL, 0.09 * offsets[-1]))
     return np.array([*(-x for x in reversed(offsets[1:])), *offsets])
 
 
@@ -184,7 +184,7 @@ class World:
     def _ground(self, start: float, stop: float) -> Mesh:
         road = self._road
         ends, _ = road.plane(np.array([start, stop]), np.zeros(2))
-        x = np.linspace(ends[0], ends[1], max(int((ends[1] - ends[0]) / _CELL), 1) + 1)
+        x = np.linspace(ends[0], ends[1], max(int((ends[1] - ends[0]) / _GROUND_CELL), 1) + 1)
         s = road.station(x)
         _, middle = road.plane(s, np.zeros_like(s))
         # Sheared along y, not swept along the road: that would fold in bends.
@@ -202,7 +202,7 @@ class World:
 
 _KNOTS = 50.0
 """Knots of the trajectory's spline in a second; nothing in it moves faster than a tenth of it."""
-_START = 2.0  # seconds in which a vehicle that stood reaches its speed
+_SPEED_UP = 2.0  # seconds in which a vehicle that stood reaches its speed
 
 
 class Ride:
@@ -224,11 +224,11 @@ class Ride:
         # Smoothed over a third of a second: no vehicle changes its acceleration at once.
         moves = np.ones_like(knots)
         if standstill:
-            self.duration += standstill + _START / 2.0
+            self.duration += standstill + _SPEED_UP / 2.0
             knots = np.arange(-_KNOTS, np.floor((self.duration + 1.0) * _KNOTS)) / _KNOTS
             since = np.maximum(knots - standstill, 0.0)
-            moves = np.minimum(since / _START, 1.0)
-            knots_of_drive = since - _START * (moves - 0.5 * moves**2)
+            moves = np.minimum(since / _SPEED_UP, 1.0)
+            knots_of_drive = since - _SPEED_UP * (moves - 0.5 * moves**2)
             along = np.interp(knots_of_drive, times, s)
         else:
             along = np.interp(knots, times, s)

@@ -1,14 +1,14 @@
 """The configuration of a study: the settings that both stages share."""
 
-import logging
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from adaptune._system.strict import StrictModel
 from adaptune.errors import Finding, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.health import HealthCheck
@@ -17,9 +17,6 @@ from adaptune.recording.config import Fractions, SequenceConfig, Transform, part
 from adaptune.ros.steering import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace
-from adaptune.strict import StrictModel
-
-_log = logging.getLogger(__name__)
 
 
 def _file_name(name: str) -> str:
@@ -181,11 +178,6 @@ def _known_mode(name: str) -> str:
     return name
 
 
-@cache
-def _say_worth() -> None:
-    _log.warning("online.worth: is ignored; what a bank may cost is online.budget")
-
-
 def read_budget(given: Any) -> float | str | None:
     """A budget in milliseconds, or as ``3x`` in times the baseline's; or a ValueError."""
     with suppress(ValueError, TypeError):
@@ -225,14 +217,6 @@ class OnlineConfig(StrictModel):
         if isinstance(self.budget, str):
             return float(self.budget[:-1]) * baseline
         return self.budget
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_worth(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "worth" in data:
-            _say_worth()
-            data = {key: value for key, value in data.items() if key != "worth"}
-        return data
 
     @property
     def rules(self) -> tuple[str, ...]:

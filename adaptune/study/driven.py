@@ -8,21 +8,22 @@ from itertools import islice
 import numpy as np
 
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import LOST_ABOVE, cap, sub_trajectory_rte
+from adaptune.metrics import LOST_ABOVE
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE, STANDBY
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import Factory
 from adaptune.odometry.registry import odometry_class
-from adaptune.odometry.tracker import Tracker
 from adaptune.paired import MIN_RECORDINGS
 from adaptune.reference.check import hard_to_track
+from adaptune.reference.judge import Reference
+from adaptune.runs.loop import replay
 from adaptune.space import ODOMETRY, ParameterSet
 from adaptune.study.config import OnlineConfig, SwitchingConfig
 from adaptune.study.study import FIXED_SET, MODEL, Mechanism, Study
 
-PER_STRETCH = 4
-"""Sub-trajectories of a stretch, the unit of evidence."""
+PER_SEGMENT = 4
+"""Sub-trajectories of a segment, the unit of evidence."""
 OWN, EQUAL, BELOW = "own parameters", "no more CPU time", "just below the budget"
 WITHIN, ANY, UNTRAINED = "within the budget", "any CPU time", "bank without a model"
 FILES = {
@@ -49,17 +50,14 @@ def another_odometry(study: Study, name: str) -> tuple[str, float]:
     """Another odometry, with its own parameters, and its mean error in percent on a sequence."""
     own = {one.name for one in study.config.odometries.values()}
     other = "kiss_icp" if "gicp" in own else "gicp"
-    scans, stamps, T_odom_sensor = study.sequences.open(name), [], []
+    scans = study.sequences.open(name)
     if (reference := scans.reference()) is None:
         return other, math.inf
     _log.info("track is lost on %s: %s is tried there", name, other)
-    tracker = Tracker(InProcess(odometry_class(other)()), study.config.health)
-    for scan in islice(scans, MOST_SCANS):
-        stamps.append(scan.stamp)
-        T_odom_sensor.append(tracker.register(scan).T_odom_sensor)
-    T_ref_sensor = reference.at(np.array(stamps))
-    errors = sub_trajectory_rte(T_ref_sensor, np.array(T_odom_sensor), study.config.sub_trajectory)
-    known = cap(errors)[~np.isnan(errors)]
+    instance = InProcess(odometry_class(other)())
+    run = replay(islice(scans, MOST_SCANS), instance, study.config.health)
+    errors = Reference(reference, study.config.sub_trajectory).errors(run.trajectory)
+    known = errors[~np.isnan(errors)]
     return other, float(known.mean()) if len(known) else math.inf
 
 
@@ -151,10 +149,10 @@ def named(model: ErrorModel, trial: int) -> str:
 def expected_in_words(expected: Mapping[str, float]) -> str:
     """What a way to adapt is expected to gain, what it rests on, and how far that reaches.
 
-    The figures are those of `offline.tuning.Figures`.
+    The figures are those of `offline.bank_choice.Figures`.
     """
     gain, low, high = (100.0 * (1.0 - expected[key]) for key in ("geometric", "high", "low"))
-    stretches, recordings = int(expected["n_stretches"]), int(expected["n_recordings"])
+    segments, recordings = int(expected["n_segments"]), int(expected["n_recordings"])
     if recordings >= MIN_RECORDINGS:
         reach = "in other recordings"
     else:
@@ -166,7 +164,7 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
     return (
         f"expected gain {gain:.0f} % ({interval}), in the worst tenth "
         f"{expected['worst_tenth']:.2f} times the fixed set's error, {reach} "
-        f"({stretches} stretches of {sources})"
+        f"({segments} segments of {sources})"
     )
 
 

@@ -7,8 +7,9 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from adaptune import errors, yaml12
-from adaptune.archive import CURRENT
+from adaptune import errors
+from adaptune._system import yaml12
+from adaptune._system.strict import ConfigurationError, validated
 from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
@@ -23,8 +24,8 @@ from adaptune.odometry.registry import (
 from adaptune.recording import cache
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
+from adaptune.runs.archive import CURRENT
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
-from adaptune.strict import ConfigurationError, validated
 from adaptune.study.config import (
     ROLES,
     OdometryConfig,
@@ -35,7 +36,7 @@ from adaptune.study.config import (
 )
 from adaptune.study.study import Study
 
-_KINDS: dict[str, type[Float | Integer | Categorical]] = {
+_SPACE_TYPES: dict[str, type[Float | Integer | Categorical]] = {
     "float": Float,
     "integer": Integer,
     "categorical": Categorical,
@@ -141,15 +142,17 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
             keys, others = ["low", "high"], ["choices"]
             if kind == "categorical":
                 keys, others = others, [*keys, "log"]
-            if kind in _KINDS and (wrong := [key for key in others if key in given]):
+            if kind in _SPACE_TYPES and (wrong := [key for key in others if key in given]):
                 own = whole_definition(space, parameter, {})
                 usual = ", ".join(f"{key}: {json.dumps(own[key])}" for key in keys if key in own)
                 what = f"takes {' and '.join(keys)}, not {' and '.join(wrong)}"
                 mistakes.append(Finding((parameter,), what, usual and f"its own are {usual}"))
-            elif kind in _KINDS:
-                validated(_KINDS[whole["type"]], whole, (parameter,), mistakes)
+            elif kind in _SPACE_TYPES:
+                validated(_SPACE_TYPES[whole["type"]], whole, (parameter,), mistakes)
             else:
-                mistakes.append(Finding((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
+                mistakes.append(
+                    Finding((parameter,), f"give its type, one of {', '.join(_SPACE_TYPES)}")
+                )
     return mistakes
 
 

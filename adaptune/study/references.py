@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from adaptune import manifest
+from adaptune._system import manifest
 from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
 from adaptune.odometry.content import package_version
@@ -31,7 +31,7 @@ _MOST = 0.5
 """Parts that are a larger share of a recording take theirs from that of the whole."""
 _wholes: dict[str, EstimatedReference | str] = {}
 """Estimates of whole recordings that were made in this process, or why there is none."""
-KEPT = "references"
+ESTIMATES = "references"
 """Folder of the cache that keeps estimates for other studies of the same recordings."""
 
 _log = logging.getLogger(__name__)
@@ -137,7 +137,7 @@ def _estimated(
 ) -> EstimatedReference | str:
     """The same of scans that are read in some way, unless the cache keeps it."""
     scans, key = RecordedSequence(config), _key(sequences, name, config)
-    path = cache.folder() / KEPT / f"{key}.npz"
+    path = cache.folder() / ESTIMATES / f"{key}.npz"
     found: EstimatedReference | str | None = kept(path) if cache.cap() else None
     if found is not None:
         _log.info("%s: its reference was estimated before (%s)", name, path)
@@ -194,16 +194,6 @@ def estimates_in_words(estimates: Mapping[str, StoredEstimate], length: float) -
     each = "; ".join(f"{name} ({_accuracy(stored, length)})" for name, stored in estimates.items())
     words = f"Judged by an estimated reference: {each}. Intervals do not include its error."
     return [words] if each else []
-
-
-def estimates_as_data(estimates: Mapping[str, StoredEstimate], length: float) -> dict[str, Any]:
-    """The same as plain data, by the names of the sequences."""
-    found = {}
-    for name, stored in estimates.items():
-        error = stored.error(length)
-        percent = None if math.isnan(error) else round(error, 4)
-        found[name] = {"error_percent": percent, "unknown_share": stored.unknown_share}
-    return found
 
 
 def contradictions_of(

@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
-from adaptune import yaml12
+from adaptune._system import yaml12
+from adaptune._system.strict import StrictModel, validated
 from adaptune.errors import AdaptuneError, Finding, Key, OdometryError, nearest
 from adaptune.odometry.template import Template
-from adaptune.strict import StrictModel, validated
 
 _Number = int | float
 _Some = Field(min_length=1)
@@ -429,7 +429,7 @@ def _of_test(
         f"Made of the test {test.name!r} of {file.path.name}: {system.name} on "
         f"{test.dataset_name}, played {speed:g} times as fast as recorded."
     )
-    offline = {"objective": "rpe", "stretches": "all", "trials": 1}
+    offline = {"objective": "rpe", "segments": "all", "trials": 1}
     offline |= {"baseline_runs": test.iterations, "workers": test.workers}
     settings = system.settings | {"rate": speed}
     data = _study(settings, parameters, test.dataset_name, sequence, offline)
@@ -471,7 +471,7 @@ def _of_tuning(file: _File, algorithms: _File, datasets: _File) -> ImportedStudy
     if not (total := sum(weights.values())):
         raise file.error(("metric_weights",), "give ape or rpe a weight above 0")
     objective = {key: weight / total for key, weight in weights.items() if weight}
-    offline = {"objective": objective, "stretches": "all", "workers": 1} | offline
+    offline = {"objective": objective, "segments": "all", "workers": 1} | offline
     offline |= {} if tuning.hours is None else {"hours": tuning.hours}
     how = f"{tuning.tuning_algo.replace('_', ' ')} for {system.name} on {tuning.dataset}"
     about = f"Made of the tuning {tuning.name!r}, {file.path.name}: {how}."

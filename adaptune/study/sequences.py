@@ -9,8 +9,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from adaptune._system.manifest import differences, merged
+from adaptune._system.strict import ConfigurationError
 from adaptune.errors import AdaptuneError
-from adaptune.manifest import differences, merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import (
@@ -32,7 +33,6 @@ from adaptune.recording.scan import Recording
 from adaptune.reference.estimated import BREAK, EstimateError
 from adaptune.reference.stored import StoredEstimate
 from adaptune.simulation.course import Course
-from adaptune.strict import ConfigurationError
 
 _READER = 3
 """Changes where the same files give other scans or poses than before."""
@@ -160,7 +160,7 @@ class StudySequences:
                 f"{bag}: the course {name} is not recorded yet; run `adaptune simulate` with this "
                 f"study first"
             )
-        if not (file := bag.with_suffix(".json")).exists():  # of an older adaptune
+        if not (file := bag.with_suffix(".json")).exists():  # a copy of the bag alone
             return
         mend = "remove its .bag, .tum and .json, then run `adaptune simulate`"
         try:

@@ -10,17 +10,17 @@ from typing import IO, Any, Generic, Literal
 
 from typing_extensions import TypeVar
 
-from adaptune import manifest, yaml12
-from adaptune.archive import Archive, Sources
+from adaptune._system import manifest, yaml12
+from adaptune._system.files import locked, write_text
+from adaptune._system.machine import available
+from adaptune._system.strict import ConfigurationError
 from adaptune.errors import OdometryError
-from adaptune.files import locked, write_text
-from adaptune.machine import available
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry.base import OwnFile
 from adaptune.odometry.factory import Factory, OdometryFactory, OdometryPool
+from adaptune.runs.archive import Archive, Sources
 from adaptune.space import ParameterSet
-from adaptune.strict import ConfigurationError
 from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.portfolios import portfolio_sets
 from adaptune.study.sequences import StudySequences
@@ -65,6 +65,7 @@ class Study(Generic[C_co]):
     config: C_co
     folder: Path  # keeps trials, model, replays and comparison
     model_file: Path | None = None  # of another error model than the study's own
+    called: str = ""  # as a side of a comparison
 
     def __repr__(self) -> str:
         odometries, training, test = (
@@ -75,8 +76,8 @@ class Study(Generic[C_co]):
 
     @property
     def name(self) -> str:
-        """Name of the study: its folder's."""
-        return self.folder.name
+        """What it is called, by default as its folder."""
+        return self.called or self.folder.name
 
     @property
     def model_path(self) -> Path:

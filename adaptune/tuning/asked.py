@@ -10,13 +10,13 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adaptune import processes
+from adaptune._system import processes
+from adaptune._system.files import plain_name
+from adaptune._system.manifest import plain
+from adaptune._system.progress import Progress
 from adaptune.errors import AdaptuneError, NotInstalledError
-from adaptune.files import plain_name
-from adaptune.manifest import plain
 from adaptune.odometry import Odometry, registry
 from adaptune.odometry.content import module_file
-from adaptune.progress import Progress
 from adaptune.recording.clouds import CLOUDS
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.fleet import Reading, check_alike, recordings_at

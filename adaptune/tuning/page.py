@@ -5,23 +5,23 @@ from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
-from adaptune import trial_rows
-from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.report.charts import Chart, Charts
 from adaptune.report.page import Page, PageSection, write_page
 from adaptune.report.tables import Listing
+from adaptune.runs.archive import Archive
 from adaptune.tuning.verdict import front_table
 from offline.charts import charts_of_trials, charts_of_validation
 from offline.config import OfflineStudy, OfflineStudyConfig
+from offline.trial_table import rows, select, with_units
 from online.charts import charts_of_comparison, charts_of_replays
-from online.compare import ComparedReplays
+from online.compare import Comparison
 from online.modes import sequences_without_model
 from online.replayed import ReplayedSequence, read_replays
 from online.tables import modes_in_words, tables
 
 
-def write_study_page(study: OfflineStudy, found: ComparedReplays | str) -> Path:
+def write_study_page(study: OfflineStudy, found: Comparison | str) -> Path:
     """Write all that is known of a study as one page; `found` may be why nothing is compared."""
     read = cache(partial(read_replays, study))
 
@@ -52,7 +52,7 @@ def write_study_page(study: OfflineStudy, found: ComparedReplays | str) -> Path:
 
 
 def _comparison(
-    found: ComparedReplays | str, length: float, read: Callable[[str], ReplayedSequence]
+    found: Comparison | str, length: float, read: Callable[[str], ReplayedSequence]
 ) -> PageSection:
     title = "What adapting gained"
     if isinstance(found, str):
@@ -66,16 +66,15 @@ def _comparison(
 def _search(study: OfflineStudy) -> PageSection:
     section = _of_charts("What was tried", partial(charts_of_trials, study))
     try:
-        finished = trial_rows.rows(Archive(study.folder / "trials"), study.training)
+        finished = rows(Archive(study.folder / "trials"), study.training)
     except AdaptuneError as error:
         return replace(section, notes=(*section.notes, f"{error}."))
     if not finished:
         return section
-    best = trial_rows.select([row for row in finished if row["mean"] is not None], "mean", top=50)
+    best = select([row for row in finished if row["mean"] is not None], "mean", top=50)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
-    listed = trial_rows.with_units(best, study.training, study.odometry.space.labels)
-    each = trial_rows.by_odometry(finished)
-    return replace(section, tables=(*([each] if each else ()), Listing(title, listed)))
+    listed = with_units(best, study.training, study.odometry.space.labels)
+    return replace(section, tables=(Listing(title, listed),))
 
 
 def _settings(config: OfflineStudyConfig) -> PageSection:
@@ -87,8 +86,8 @@ def _settings(config: OfflineStudyConfig) -> PageSection:
         elif value is not None:
             yield key, value
 
-    rows = [{"key": key, "value": str(v)} for key, v in leaves(config.resolved(), "")]
-    return PageSection("Settings", tables=(Listing("The study's YAML, with its defaults", rows),))
+    every = [{"key": key, "value": str(v)} for key, v in leaves(config.resolved(), "")]
+    return PageSection("Settings", tables=(Listing("The study's YAML, with its defaults", every),))
 
 
 def _of_charts(title: str, make: Callable[[], Charts]) -> PageSection:

@@ -12,23 +12,23 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from adaptune._system.files import plain_name
+from adaptune._system.machine import pin
+from adaptune._system.manifest import digest, plain
+from adaptune._system.progress import Progress, bars_and_words
+from adaptune._system.yaml12 import Document
 from adaptune.errors import AdaptuneError
-from adaptune.files import plain_name
-from adaptune.machine import pin
-from adaptune.manifest import digest, plain
 from adaptune.odometry import Odometry
 from adaptune.odometry.base import ToolSettings
 from adaptune.odometry.registry import is_user_class, odometry_class
-from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.fleet import Reading
 from adaptune.reference.check import greatest_speed
 from adaptune.space import in_words
 from adaptune.study.references import ensure_references
 from adaptune.tuning.asked import Asked, check_guarded, named_odometry, recorded, words_of
 from adaptune.tuning.studies import is_image
-from adaptune.yaml12 import Document
 from offline.config import OfflineStudy, load_study
-from online.gate import Gate, Shared, Side, compare_sides, shared_replays
+from online.gate import Gate, SharedReplays, compare_sides, shared_replays, stored_replays
 from online.modes import BASELINE, FIXED, replay_modes, sequences_without_model
 from online.turns import Costs, by_turns
 
@@ -44,25 +44,25 @@ Lengths that suit the recordings would change with each that is added, and with 
 
 def sides(
     given: Sequence[Any], asked: Asked, length: float | None, show: Progress
-) -> tuple[Side, Side]:
-    """The replays of both sides, the new one first; those that are missing are made.
+) -> tuple[OfflineStudy, OfflineStudy]:
+    """Both sides as studies, the new one first; replays that are missing are made.
 
     See `compare` for what a side is. They are driven by turns, each alone on a core. `length` is
     that of sub-trajectories; by default the studies', or `CAR` or `ROBOT`.
     """
     called, now = [*map(_called, given)], time.time()
     studies = _driven(given, asked, show) if asked.recordings else _studies(called)
-    _drive(studies, called, show)
-    studies = studies if length is None else [_over(length, one) for one in studies]
-    new, old = (Side(name, study) for name, study in zip(called, studies, strict=True))
+    studies = [replace(one, called=name) for one, name in zip(studies, called, strict=True)]
+    _drive(studies, show)
+    new, old = studies if length is None else (_over(length, one) for one in studies)
     for side in (new, old):
-        replays = (side.replays(mode).values() for mode in (FIXED, BASELINE))
+        replays = (stored_replays(side, mode).values() for mode in (FIXED, BASELINE))
         made = [one.made for of in replays for one in of]
         if made and (first := min(made)) < now:
             _log.info(
                 f"{side.name}: its replays of {datetime.fromtimestamp(first):%Y-%m-%d %H:%M} are "
                 f"compared. Libraries and other files that it loads may have changed since; to "
-                f"drive it anew, remove {side.study.folder / 'replays'}"
+                f"drive it anew, remove {side.folder / 'replays'}"
             )
     return new, old
 
@@ -124,7 +124,7 @@ def compare(
     return compare_sides(shared, measured, worse / 100.0, bound)
 
 
-def costs(shared: Shared, show: Progress) -> dict[str, Costs | str]:
+def costs(shared: SharedReplays, show: Progress) -> dict[str, Costs | str]:
     """What both sides cost on each recording, driven twice by turns; or why that is not known."""
     found: dict[str, Costs | str] = {}
     for pair in shared.pairs:
@@ -213,20 +213,20 @@ def _named(given: str) -> dict[str, Any]:
     return {"name": given}
 
 
-def _drive(studies: Sequence[OfflineStudy], called: Sequence[str], show: Progress) -> None:
+def _drive(studies: Sequence[OfflineStudy], show: Progress) -> None:
     """Make the replays of the baselines that are missing, of a study that is a file.
 
     Both sides take turns on each recording, so that both meet the same state of the machine.
     """
     due = [
-        (name, side, study)
-        for side, study in zip(called, studies, strict=True)
-        if not Side(side, study).replays(FIXED)
+        (name, study)
+        for study in studies
+        if not stored_replays(study, FIXED)
         for name in sequences_without_model(study.config)
     ]
-    for name, side, study in sorted(due, key=lambda one: one[0]):
+    for name, study in sorted(due, key=lambda one: one[0]):
         # Of the same text, the second one would not be shown.
-        texts = {f"{name}, {BASELINE}": f"{name}, {side}"}
+        texts = {f"{name}, {BASELINE}": f"{name}, {study.name}"}
 
         def shown(text: str, *how: Any, texts: dict[str, str] = texts) -> None:
             show(texts.get(text, text), *how)

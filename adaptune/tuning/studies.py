@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptune import manifest
+from adaptune._system import manifest
+from adaptune._system.files import plain_name, write_text
+from adaptune._system.progress import Progress, about
+from adaptune._system.yaml12 import Document, YamlError, YamlPath, dump
 from adaptune.errors import AdaptuneError, NotInstalledError
-from adaptune.files import plain_name, write_text
 from adaptune.metrics import travelled
 from adaptune.odometry import registry
 from adaptune.odometry.portfolio import ScanKind, portfolios_of, read_portfolio
-from adaptune.progress import Progress, about
 from adaptune.recording.config import ESTIMATED, SOURCES
 from adaptune.recording.fleet import recordings_at
 from adaptune.recording.inspect import Inspection
@@ -29,7 +30,6 @@ from adaptune.reference.carried import begin_of, without
 from adaptune.trajectory import Trajectory, read_trajectory
 from adaptune.tuning import EACH, TRIALS
 from adaptune.tuning.asked import Asked, odometries_of, recorded, words_of
-from adaptune.yaml12 import Document, YamlError, YamlPath, dump
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
@@ -135,10 +135,10 @@ def proposed(found: Inspection, deep: bool, show: Progress) -> tuple[float | Non
     return share, length, "; ".join(filter(None, words))
 
 
-def written(
+def write_study(
     asked: Asked, overrides: Sequence[str], folder: Path, show: Progress
 ) -> tuple["OfflineStudy", list[str]]:
-    """The study, which is written, or to whose file is added what is new.
+    """Write the study's file, or add what is new to it; the study.
 
     It has the overrides, which the file has not. Returns the names of new recordings, too.
     """
@@ -170,7 +170,7 @@ def written(
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
             f"resume it, or tune in a folder of its own with `--folder {free}`"
         )
-    new = _grown(path, asked, show)
+    new = _add_recordings(path, asked, show)
     limits = (f"{key}={value}" for key, value in asked.limits.items())
     return load_study(path, [*overrides, *limits], folder), new
 
@@ -218,7 +218,7 @@ def _decided(
         insisted = draft.config.sequences[name].reference != one.given.get("reference")
         if not insisted and (estimated := _less_noisy(draft, name, show)) is not None:
             draft, one.given["reference"] = estimated, ESTIMATED
-    length, share, speed = _split(draft, list(named), show)
+    length, share, speed = _measure_split(draft, list(named), show)
     return study(length, share) | {"health": {"max_speed": speed}}
 
 
@@ -235,7 +235,7 @@ def _tell_unlike(portfolios: Iterable[str], recordings: Mapping[str, Inspection]
             )
 
 
-def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
+def _add_recordings(path: Path, asked: Asked, show: Progress) -> list[str]:
     """Add the recordings that a study does not name yet to where they belong; their names."""
     try:
         document = Document.of_file(path)
@@ -266,11 +266,11 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     }
     new_of = {name: recording.given for name, recording in added.items()}
     more: dict[YamlPath, Any] = {("sequences",): new_of} | {(r,): n for r, n in into.items() if n}
-    n, before = offline.get("stretches", 12), len(data.get("training") or ()) or 1
+    n, before = offline.get("segments", 12), len(data.get("training") or ()) or 1
     if into["training"] and isinstance(n, int):
-        # As many stretches of each as before: the trials that there are stay.
+        # As many segments of each as before: the trials that there are stay.
         each, now = max(4, -(-n // before)), before + len(into["training"])
-        more[("offline", "stretches")] = each * now
+        more[("offline", "segments")] = each * now
     for at, value in more.items():
         document = Document(document.with_added(at, value))
     if (document.data or {})["sequences"] != data["sequences"] | new_of:
@@ -309,7 +309,7 @@ def _less_noisy(study: "OfflineStudy", name: str, show: Progress) -> "OfflineStu
     return study
 
 
-def _split(
+def _measure_split(
     study: "OfflineStudy", whole: Sequence[str], show: Progress
 ) -> tuple[float, float, float]:
     """Metres of the sub-trajectories by which a study should judge.
@@ -413,7 +413,7 @@ def _system_of(given: str) -> dict[str, Any] | None:
 
 def is_image(given: str) -> bool:
     """Whether a name is that of an image, and of no odometry."""
-    from adaptune.odometry.docker.engine import EngineError, image_digest
+    from adaptune.odometry.systems.engine import EngineError, image_digest
 
     of_odometry = given in {*registry.ODOMETRIES, *registry.PROGRAMS, "all"}
     if of_odometry or not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
@@ -427,7 +427,7 @@ def is_image(given: str) -> bool:
     return True
 
 
-def proposed_system(asked: Asked, folder: Path | None, show: Progress) -> Path | None:
+def write_system_study(asked: Asked, folder: Path | None, show: Progress) -> Path | None:
     """Write a study of a ROS system to fill in; None if the odometry is none."""
     if (settings := _system_of(asked.odometry)) is None:
         return None

@@ -9,24 +9,24 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from adaptune._system.files import plain_name
+from adaptune._system.progress import Progress, bars_and_words
 from adaptune.errors import AdaptuneError
-from adaptune.files import plain_name
 from adaptune.odometry import Odometry
 from adaptune.odometry.registry import forget_user_code
-from adaptune.progress import Progress, bars_and_words
 from adaptune.recording.fleet import Reading
 from adaptune.report.page import FIGURES
 from adaptune.space import ParameterSet
 from adaptune.tuning.asked import Asked, check_guarded, named_odometry
 from adaptune.tuning.page import write_study_page
-from adaptune.tuning.studies import written
+from adaptune.tuning.studies import write_study
 from adaptune.tuning.verdict import write_verdict
 from offline.campaign import FITTING
 from offline.config import OfflineStudy
 from offline.scenario import scenario
 from offline.search import ELAPSED, Stopwatch
-from offline.train import Training, odometry_rows, train
-from online.compare import ComparedReplays, compare
+from offline.train import Training, run_odometries, train
+from online.compare import Comparison, compare
 from online.modes import BASELINE, FIXED, replay_modes, run_replays
 from online.statistics import ALL
 
@@ -45,7 +45,7 @@ class Tuned:
 
     study: OfflineStudy
     training: Training
-    comparison: ComparedReplays
+    comparison: Comparison
     page: Path  # HTML, with all charts and tables
     more: Sequence[str] = ()  # recordings that the study did not name before
     before: ParameterSet | None = None  # the fixed set before, where there was one
@@ -67,7 +67,7 @@ class Tuned:
         """What CPU time buys: a row for each choice, with its error and its cost.
 
         Those of the test are from there, the others of whole drives in training; the errors of
-        `trials` are of stretches.
+        `trials` are of segments.
         """
         return _table(self.comparison.front)
 
@@ -129,7 +129,7 @@ class Tuned:
         return f"<p>{escape(self.verdict)}</p>{shown}{table}"
 
 
-def left_out_rows(training: Training, comparison: ComparedReplays) -> list[dict[str, Any]]:
+def left_out_rows(training: Training, comparison: Comparison) -> list[dict[str, Any]]:
     """Errors of the baseline and of what the other recordings recommend on each, the worst first.
 
     For the test, that is the fixed set.
@@ -241,7 +241,7 @@ def tune_asked(
         asked = asked._replace(portfolio=str(Path(asked.portfolio).resolve()))
     folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)
-    study, more = written(asked, overrides, folder, show)
+    study, more = write_study(asked, overrides, folder, show)
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
@@ -252,10 +252,10 @@ def tune_asked(
                 replay_modes(study, test, (BASELINE, FIXED), show, training.model)
                 show = within(hours, clock, show)
             run_replays(study, study.model_path, show)
-            of_each = odometry_rows(study, training, show, cluster)
+            of_each = run_odometries(study, training, show, cluster)
         except OutOfTimeError as why:
             _log.warning("%s", why)
-        return Tuned(study, training, *compared(study), more, before, of_each)
+        return Tuned(study, training, *write_comparison(study), more, before, of_each)
 
 
 class OutOfTimeError(AdaptuneError):
@@ -291,8 +291,8 @@ def _folder(asked: Asked) -> Path:
     return Path("runs") / (stem if odometry == "gicp" else f"{stem}_{others}")
 
 
-def compared(study: OfflineStudy) -> tuple[ComparedReplays, Path]:
-    """Compare a study's replays, and write the verdict, and the page, also of one that runs."""
+def write_comparison(study: OfflineStudy) -> tuple[Comparison, Path]:
+    """Compare a study's replays; write tables, verdict and page, also of a study that runs."""
     try:
         found = compare(study)
     except AdaptuneError as error:

@@ -4,20 +4,17 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from adaptune.archive import Archive
-from adaptune.files import write_text
-from adaptune.manifest import plain
+from adaptune._system.files import write_text
+from adaptune._system.manifest import plain
 from adaptune.model.registry import ADAPTIVE
 from adaptune.report.tables import Listing
 from adaptune.study.driven import COST, ERROR, OWN
 from offline.choice import USUAL_BUDGET
 from offline.config import OfflineStudy
-from online.compare import ComparedReplays
+from online.compare import Comparison
 from online.modes import BASELINE
 
-FILE = "verdict.json"
+VERDICT = "verdict.json"
 
 
 def front_table(
@@ -60,7 +57,7 @@ def _of_training(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"* Error and cost are of training{next(there, '')}."
 
 
-def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:
+def write_verdict(study: OfflineStudy, found: Comparison) -> None:
     """Write ``verdict.json`` into the study's folder: what to do, what that gives, and why."""
     config, model = study.config, found.model
     row = next((row for row in found.front if row["recommended"]), dict[str, Any]())
@@ -68,11 +65,6 @@ def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:
     last = next((one for one in found.rows[::-1] if one.mode == mode), None)
     ratio = None if last is None else last.against.get(BASELINE)
     action = "keep" if row.get("what") == OWN else "drive" if row else found.advised or "unknown"
-    ms = None if model is None else model.milliseconds
-    own = next((one["trial"] for one in found.front if one["what"] == OWN), None)
-    if model is not None and model.costs is not None and own is not None and ms is None:
-        cost = USUAL_BUDGET * model.costs.alone(own)
-        ms = cost if np.isfinite(cost) else None
     data = {
         "action": action,
         "odometry": row.get("odometry") or next(iter(config.odometries)),
@@ -85,11 +77,8 @@ def write_verdict(study: OfflineStudy, found: ComparedReplays) -> None:
         "ratio": ratio and ratio.value,
         "interval": ratio and ratio.interval,
         "on_another_drive": [row["low"], row["high"]] if row else None,
-        "sets_tried": len(Archive(study.folder / "trials").sets()),
-        "sets_asked": config.offline.most_trials,
         "budget": config.online.budget or f"{USUAL_BUDGET:g}x",
-        "budget_ms": ms,
         "why": found.verdict,
         "front": found.front,
     }
-    write_text(study.folder / FILE, json.dumps(plain(data), indent=1) + "\n")
+    write_text(study.folder / VERDICT, json.dumps(plain(data), indent=1) + "\n")

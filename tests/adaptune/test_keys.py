@@ -2,7 +2,7 @@ from collections.abc import Iterator
 
 from pydantic import BaseModel
 
-from adaptune.strict import alternatives
+from adaptune._system.strict import alternatives
 from offline.config import OfflineStudyConfig
 
 MOST_KEYS = 45

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import rec
 
+from adaptune._system.strict import ConfigurationError
 from adaptune.recording import SequenceConfig
 from adaptune.recording.export import export
 from adaptune.recording.recording import open_sequence
-from adaptune.strict import ConfigurationError
 from adaptune.trajectory import write_tum
 from offline.config import load_study
 

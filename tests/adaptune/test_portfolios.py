@@ -3,7 +3,7 @@
 import pytest
 from setups import failure
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.odometry.portfolio import read_portfolio
 from adaptune.space import ODOMETRY
 from offline.config import load_study

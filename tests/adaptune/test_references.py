@@ -11,7 +11,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence, open_sequence, wants_estimate
 from adaptune.reference.estimated import EstimateError
 from adaptune.study import references
-from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
+from adaptune.study.references import ensure_references, estimates_of
 from adaptune.trajectory import read_trajectory
 from offline.config import load_study
 
@@ -20,7 +20,8 @@ EXTRINSIC = "sequences.one.extrinsic=[0, 2, 0, 0, 0, 0, 1]"
 
 
 def data(study, names):
-    return estimates_as_data(estimates_of(study.sequences, names), study.config.sub_trajectory)
+    length, found = study.config.sub_trajectory, estimates_of(study.sequences, names)
+    return {name: (stored.error(length), stored.unknown_share) for name, stored in found.items()}
 
 
 def ensure(study, names, *given, **more):
@@ -87,9 +88,8 @@ def test_where_it_is_not_trusted_there_is_a_gap(estimator, load, caplog):
     at = reference.at(np.array([drives.FIRST_STAMP + 25 * 10**8]))
     assert np.isnan(at).all()
     assert "unknown for 25 % of the scans" in caplog.text
-    assert data(study, ["one", "two"]) == {
-        "one": {"error_percent": 0.3116, "unknown_share": pytest.approx(0.25, abs=0.01)}
-    }
+    found = data(study, ["one", "two"])
+    assert found == {"one": (pytest.approx(0.3116, abs=1e-4), pytest.approx(0.25, abs=0.01))}
 
 
 @pytest.mark.usefixtures("estimator")
@@ -142,7 +142,7 @@ def test_another_study_of_the_same_recording_takes_what_is_kept(
 
     assert estimated() == 1
     # The same content under another path, with what is said of the reference alone.
-    (kept,) = (cache.folder() / references.KEPT).iterdir()
+    (kept,) = (cache.folder() / references.ESTIMATES).iterdir()
     os.utime(kept, (1.0, 1.0))
     assert estimated(f"sequences.one.bag={copy}", "sequences.one.max_gap=9") == 1
     assert kept.stat().st_mtime > 1.0

@@ -2,7 +2,7 @@ import pytest
 import yaml
 from setups import failure
 
-from adaptune.strict import ConfigurationError
+from adaptune._system.strict import ConfigurationError
 from offline.config import load_study
 
 COURSES = "courses.cave={scenes: [cave], length: 10, seed: 1}"

@@ -8,10 +8,10 @@ import rec
 from drives import FIRST_STAMP, cloud
 from needs import needs_evalio
 
-from adaptune import yaml12
-from adaptune.odometry.docker import rustle
+from adaptune._system import yaml12
+from adaptune._system.strict import ConfigurationError
+from adaptune.odometry.systems import rustle
 from adaptune.odometry.template import Template
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from tables import table
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.space import (
     ODOMETRY,

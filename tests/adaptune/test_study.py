@@ -5,9 +5,8 @@ import pytest
 from needs import needs_evalio
 from setups import failure
 
+from adaptune._system.strict import ConfigurationError
 from adaptune.errors import import_extra
-from adaptune.strict import ConfigurationError
-from adaptune.study import config
 from offline.config import load_study
 
 STIFF = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
@@ -48,13 +47,6 @@ def test_a_budget_is_in_milliseconds_or_in_times_of_the_baseline(study_file):
         text = failure(study_file, f"online.budget={wrong}")
         assert "online.budget" in text
         assert "give milliseconds of CPU time a scan, or times the baseline's, as 3x" in text
-
-
-def test_a_minimum_gain_is_ignored_with_a_sentence(study_file, caplog):
-    config._say_worth.cache_clear()
-    online = load_study(study_file, ["online.worth=0.3"]).config.online
-    assert not hasattr(online, "worth")
-    assert caplog.text.count("online.worth: is ignored") == 1
 
 
 def test_an_odometry_that_needs_an_imu(study_file):

@@ -1,7 +1,7 @@
 import numpy as np
 
 from adaptune.live.evidence import LiveEvidence
-from adaptune.live.hops import LiveSquares
+from adaptune.live.hops import HopSquares
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.selector import CANDIDATES, UntrainedSelector, untrained_sets
@@ -42,7 +42,7 @@ def test_the_baseline_has_all_the_weight_until_others_are_confirmed(monkeypatch)
     selector.reset()
     assert selector.select() == selection
     # The second does as well as the baseline, the others are far off.
-    squares = LiveSquares(np.diag([1.0, 1.0, 100.0, 100.0]), 0.0, 6.0)
+    squares = HopSquares(np.diag([1.0, 1.0, 100.0, 100.0]), 0.0, 6.0)
     monkeypatch.setattr(LiveEvidence, "squares", lambda _: squares)
     weights = selector.select().weights
     assert weights[0] > weights[1] > 0.3

@@ -11,13 +11,13 @@ from drives import FIRST_STAMP
 from kills import contents
 
 import offline.train
-from adaptune import yaml12
-from adaptune.archive import Archive, Trial
+from adaptune._system import yaml12
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.metrics import window_ends
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import averaged
 from adaptune.odometry.portfolio import read_portfolio
+from adaptune.runs.archive import Archive, Trial
 from offline import campaign
 from offline.campaign import BaselineError, check_baseline
 from offline.config import load_study
@@ -42,7 +42,7 @@ def test_the_fixed_set_is_the_best_of_all_where_whole_recordings_are_driven(trai
     assert {row["state"] for row in training.trials} == {"complete"}
 
 
-LONG = ["sub_trajectory=0.3", "offline.stretches=4", "training=[one]", "offline.trials=8"]
+LONG = ["sub_trajectory=0.3", "offline.segments=4", "training=[one]", "offline.trials=8"]
 
 
 def test_finalists_are_driven_along_the_whole_of_long_recordings(study_file, tmp_path, monkeypatch):
@@ -53,30 +53,30 @@ def test_finalists_are_driven_along_the_whole_of_long_recordings(study_file, tmp
     finalists = {int(path.name[:5]) for path in files}
     assert {0, int(np.argmin(means)), training.model.fixed} <= finalists
     assert len(finalists) < len(means)
-    whole = {n: archive.read("one", n, whole=True).mean_error for n in finalists}
+    whole = {n: archive.read("one", n, kind="whole").mean_error for n in finalists}
     assert training.rows[0]["fixed, whole"] == whole[training.model.fixed]
     # All sets are driven on the same scans, about half of them.
     driven = np.isfinite(archive.read("one", 3).T_odom_sensor[:, 0, 0])
     assert 0.3 < driven.mean() < 0.7
-    assert np.isfinite(archive.read("one", 0, whole=True).T_odom_sensor).all()
+    assert np.isfinite(archive.read("one", 0, kind="whole").T_odom_sensor).all()
     again = {path: path.stat().st_mtime_ns for path in files}
     train(study)
     assert {path: path.stat().st_mtime_ns for path in files} == again
     # All drive beside one that is lacking, so that their costs compare, also after Ctrl-C.
-    archive.trial_path("one", max(finalists), whole=True).unlink()
+    archive.trial_path("one", max(finalists), kind="whole").unlink()
     write, written = Archive.write, []
 
-    def interrupted(self, name, number, trial, whole=False, bare=False):
+    def interrupted(self, name, number, trial, kind=""):
         if len(written) == 1:
             raise KeyboardInterrupt
         written.append(number)
-        write(self, name, number, trial, whole, bare)
+        write(self, name, number, trial, kind)
 
     with monkeypatch.context() as patch:
         patch.setattr(Archive, "write", interrupted)
         with pytest.raises(KeyboardInterrupt):
             train(study)
-    first = archive.trial_path("one", written[0], whole=True)
+    first = archive.trial_path("one", written[0], kind="whole")
     assert [path for path in files if path.exists()] == [first]
     again[first] = first.stat().st_mtime_ns
     train(study)
@@ -111,7 +111,7 @@ def test_number_of_workers_changes_nothing(trained, study_file, tmp_path):
     assert contents(alone.folder) == contents(study.folder)
 
 
-def test_nor_does_it_where_stretches_are_driven(study_file, tmp_path):
+def test_nor_does_it_where_segments_are_driven(study_file, tmp_path):
     found = []
     for workers in (1, 3):
         given = [*LONG, f"offline.workers={workers}"]
@@ -225,11 +225,11 @@ def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, name, fa
 
 def test_a_baseline_with_a_fault_or_without_poses_is_refused():
     n = 40
-    run = Trial({}, np.tile(np.eye(4), (n, 1, 1)), *np.zeros((4, n)))
-    check_baseline("mine", "one", replace(run, unhealthy={"no_pose": 3}))
+    run = Trial.of({}, np.tile(np.eye(4), (n, 1, 1)), *np.zeros((2, n)), 0.0)
+    check_baseline("mine", "one", run)
     with pytest.raises(BaselineError, match=r"sequences\.one: mine fails .*baseline: hm: mend"):
-        check_baseline("mine", "one", replace(run, faults=("hm",)))
-    failed = replace(run, faults=("hm",), failure="no pose for 4 of 40 scans")
+        check_baseline("mine", "one", replace(run, reasons=("hm",)))
+    failed = replace(run, reasons=("hm",), failure="no pose for 4 of 40 scans")
     with pytest.raises(BaselineError, match=r"sequences\.one: mine fails .*: no pose .*; hm: mend"):
         check_baseline("mine", "one", failed)
 

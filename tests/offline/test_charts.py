@@ -6,21 +6,22 @@ import pytest
 from made_trials import made_table, write_trials
 from random_models import SPACE
 
-from adaptune import yaml12
-from adaptune.archive import Summary
+from adaptune._system import yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.report.charts import Band, Line, Points, Words
+from adaptune.runs.archive import TrialSummary
+from offline.bank_choice import figures
 from offline.charts import (
     charts_of_trials,
     charts_of_validation,
     front_chart,
     iteration_chart,
     scatter_chart,
-    stretch_chart,
+    segment_chart,
 )
 from offline.config import OfflineConfig, load_study
-from offline.trial_table import TrialTable, TriedSet, importances, read_trials, trial_table
-from offline.tuning import figures
+from offline.objective import JudgedSet
+from offline.trial_table import TrialTable, importances, read_trials, trial_table
 
 
 def error(name, parameters):
@@ -57,7 +58,7 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
 
 def test_a_trial_that_failed_is_no_best():
     runs = {
-        i: Summary(
+        i: TrialSummary(
             SPACE.baseline | {"points": i + 1},
             1.0 - 0.1 * i,
             0,
@@ -73,9 +74,7 @@ def test_a_trial_that_failed_is_no_best():
 
 def tried(*trials, fixed=None):
     """A table of trials, each with its cost and its error."""
-    made = [
-        TriedSet(number, {}, {}, value, True, cost) for number, (cost, value) in enumerate(trials)
-    ]
+    made = {n: JudgedSet({}, value, cost=cost) for n, (cost, value) in enumerate(trials)}
     return TrialTable(SPACE, ["one"], made, fixed=fixed)
 
 
@@ -103,8 +102,8 @@ def test_one_known_point_is_no_front(more):
 
 def test_trials_that_may_be_chosen_are_on_the_front():
     table = made_table(error)
-    failed = table.trials[5]._replace(usable=False)
-    table = replace(table, trials=[*table.trials[:5], failed, *table.trials[6:]])
+    failed = table.trials[5]._replace(failure="no pose")
+    table = replace(table, trials={**table.trials, 5: failed})
     (panel,) = front_chart(table).panels
     points = of_kind(panel, Points, "tried")[0].texts
     assert list(points[:6]) == ["baseline", *(f"trial {i}" for i in (1, 2, 3, 4, 6))]
@@ -156,7 +155,7 @@ def study(study_file, tmp_path):
 def test_trials_have_their_charts(study):
     assert [*charts_of_trials(study)] == ["No trials: run `adaptune offline`."]
     cost = {"register_ms": 2.0, "prepare_ms": 1.0}
-    write_trials(study, lambda _, p: p["keyframe_interval"], 20, usage=cost)
+    write_trials(study, lambda _, p: p["keyframe_interval"], 20, others=cost)
     charts = [*charts_of_trials(study)]
     assert [chart.key for chart in charts] == [
         *("iterations", "importance", "parameter-scatter", "front")
@@ -181,27 +180,27 @@ def test_validation_is_read_or_missed(study):
     assert [*charts_of_validation(study.folder)] == ["No validation: run `adaptune validate`."]
     study.folder.mkdir()
     row = {"recording": "one", "fixed [%]": 0.5}
-    rows = [row | {"stretch": i, "adaptive": 0.8 + 0.01 * i} for i in range(4)]
-    (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
-    assert [chart.key for chart in charts_of_validation(study.folder)] == ["stretches"]
+    rows = [row | {"segment": i, "adaptive": 0.8 + 0.01 * i} for i in range(4)]
+    (study.folder / "segments.json").write_text(json.dumps(rows), "utf-8")
+    assert [chart.key for chart in charts_of_validation(study.folder)] == ["segments"]
 
 
 @pytest.mark.parametrize("text", ["[{", '[{"a": 1}]'])
 def test_a_damaged_validation_is_named(study, text):
     (study.folder).mkdir(exist_ok=True)
-    (study.folder / "stretches.json").write_text(text, "utf-8")
-    with pytest.raises(AdaptuneError, match=r"stretches\.json: is damaged .*adaptune validate"):
+    (study.folder / "segments.json").write_text(text, "utf-8")
+    with pytest.raises(AdaptuneError, match=r"segments\.json: is damaged .*adaptune validate"):
         list(charts_of_validation(study.folder))
 
 
-def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
+def test_segments_are_sorted_and_have_the_interval_of_their_mean():
     ratio = np.exp(np.random.default_rng(0).normal(-0.2, 0.1, 12))
-    of_drives = [{"recording": f"drive_{i // 6}", "stretch": i % 6} for i in range(12)]
+    of_drives = [{"recording": f"drive_{i // 6}", "segment": i % 6} for i in range(12)]
     rows = [
         row | {"fixed [%]": 0.5, "one set": 1.0, "adaptive": float(adaptive)}
         for row, adaptive in zip(of_drives, ratio, strict=True)
     ]
-    (panel,) = stretch_chart(rows).panels  # one set is the fixed set
+    (panel,) = segment_chart(rows).panels  # one set is the fixed set
     (points,) = of_kind(panel, Points)
     assert list(points.texts) == [row["recording"] for row in rows]
     np.testing.assert_array_equal(np.argsort(points.x), np.argsort(points.y))

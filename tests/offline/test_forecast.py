@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive
-from offline import campaign
-from offline.campaign import ALONE, COST, FITTING, Forecast, forecast
+from adaptune.runs.archive import Archive
+from offline.campaign import ALONE, FITTING, USUAL_COST, Forecast, forecast
 from offline.config import load_study
 from offline.search import Stopwatch
 
@@ -17,7 +16,7 @@ def test_it_follows_from_the_baseline_s_drives(study, tmp_path):
     archive = Archive(study.folder / "trials")
     costs = [1e-3 * archive.finished(name)[0].cost for name in ("one", "two")]
     alone = forecast(study, archive, 1, Stopwatch(tmp_path))
-    assert alone.each == pytest.approx(COST * 40 * sum(costs))  # scans of both
+    assert alone.each == pytest.approx(USUAL_COST * 40 * sum(costs))  # scans of both
     assert alone.rest == 0.0  # trials drove the whole recordings
     two = forecast(study, archive, 2, Stopwatch(tmp_path, replays=True))
     assert two.each == alone.each / 2
@@ -41,8 +40,8 @@ def test_banks_leave_the_search_half_of_the_time(study_file, trained_folder, tmp
 
 def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatch):
     archive = Archive(study.folder / "trials")
-    drives = campaign.read_whole_drives(archive, ["one", "two"], [0])
-    monkeypatch.setattr(campaign, "read_whole_drives", lambda *_: drives)
+    drives = archive.summaries(["one", "two"], [0])
+    monkeypatch.setattr(archive, "summaries", lambda *_: drives)
     monkeypatch.setattr(archive, "is_uncut", lambda _: False)
     found = forecast(study, archive, 1, Stopwatch(tmp_path))
     assert found.rest == pytest.approx(9 * found.each)

@@ -1,7 +1,8 @@
 import numpy as np
 from rooms import scan_at, street
 
-from adaptune.archive import Frames
+from adaptune.live.evidence import LiveEvidence
+from adaptune.runs.archive import Frames
 from offline.frames import with_measured_hops
 
 STEP = 1.0
@@ -36,6 +37,19 @@ def test_hops_are_those_of_the_sensor():
     assert told[0] == (1, 42)
     assert told[-1] == (42, 42)
     assert measured.evidence_ms > 0.0
+
+
+def test_what_selectors_do_each_second_is_in_the_time(monkeypatch):
+    """Whether the pose can be believed is checked, too, which costs more than the hops do."""
+    asked = []
+
+    def check(live):
+        asked.append(live)
+
+    monkeypatch.setattr(LiveEvidence, "check", check)
+    of = frames(32)
+    with_measured_hops(scans(of), of)
+    assert len(asked) == 4
 
 
 def test_where_the_reference_is_unknown_nothing_is_measured():

@@ -6,11 +6,12 @@ import pytest
 from labelled_places import of_errors
 from tables import table
 
-from adaptune.archive import Summary
 from adaptune.model.rules import ERROR_FLOOR, Costs, SetCost
-from adaptune.paired import of_stretches
-from offline.labelled import LabelledData, measured_costs, side_by_side
-from offline.tuning import expected_loss, log_ratios, worst_tenth
+from adaptune.paired import of_segments
+from adaptune.runs.archive import TrialSummary
+from offline.bank_choice import expected_loss, log_ratios, worst_tenth
+from offline.labelled import LabelledData, measured_costs
+from offline.whole import side_by_side
 
 
 def labelled(*of_sequences):
@@ -78,7 +79,7 @@ def test_drives_of_whole_recordings_decide_where_there_are_some():
 def run(register, prepare, failure=""):
     """A trial with these milliseconds."""
     others = {"register_ms": register, "prepare_ms": prepare}
-    return Summary({}, 1.0, 0, 0, 1.0, others, failure=failure)
+    return TrialSummary({}, 1.0, 0, 0, 1.0, others, failure=failure)
 
 
 def test_what_failed_tells_nothing_of_preparing():
@@ -138,28 +139,28 @@ def test_one_disaster_outweighs_small_gains():
     assert expected_loss(values, names) < 0.0
 
 
-def test_the_worst_tenth_counts_parts_of_stretches():
+def test_the_worst_tenth_counts_parts_of_segments():
     values = np.arange(24.0)[::-1]
     assert worst_tenth(values) == pytest.approx((23.0 + 22.0 + 0.4 * 21.0) / 2.4)
     assert worst_tenth(values[:5]) == 23.0
 
 
-def test_stretches_of_a_recording_are_not_taken_for_independent():
-    # Six recordings, each of whose stretches are alike.
+def test_segments_of_a_recording_are_not_taken_for_independent():
+    # Six recordings, each of whose segments are alike.
     of_recordings = np.array([-0.5, -0.2, -0.4, 0.1, -0.3, -0.1])
     names = [str(i) for i in range(6)]
-    one = of_stretches(of_recordings, names)
-    repeated = of_stretches(np.repeat(of_recordings, 2), list(np.repeat(names, 2)))
+    one = of_segments(of_recordings, names)
+    repeated = of_segments(np.repeat(of_recordings, 2), list(np.repeat(names, 2)))
     assert one.error == pytest.approx(of_recordings.std(ddof=1) / np.sqrt(6))
     assert repeated.error == pytest.approx(one.error)
     assert repeated.interval == pytest.approx(one.interval)
-    # Of few recordings, each stretch counts.
-    few = of_stretches(np.array([0.1, 0.3, 0.2]), ["a", "a", "b"])
+    # Of few recordings, each segment counts.
+    few = of_segments(np.array([0.1, 0.3, 0.2]), ["a", "a", "b"])
     assert few.error == pytest.approx(0.1 / np.sqrt(3.0))
-    assert of_stretches(np.array([0.1]), ["a"]).interval is None
+    assert of_segments(np.array([0.1]), ["a"]).interval is None
 
 
-def test_ratios_are_of_mean_errors_on_each_stretch():
+def test_ratios_are_of_mean_errors_on_each_segment():
     errors, fixed = np.array([1.0, 3.0, 5.0]), np.array([4.0, 4.0, 1.0])
     found = np.exp(log_ratios(errors, fixed, np.array([3, 3, 7])))
     expected = [

@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 from labelled_places import SETS, TRIALS, labelled, two_kinds, with_motions
 
+from adaptune._system.strict import ConfigurationError
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import NOTHING, Rule
 from adaptune.paired import MIN_BLOCKS
 from adaptune.space import Selection
-from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import driven
-from offline import tuning
+from offline import bank_choice
 from offline import validate as validation
 from offline.config import load_study
-from offline.train import fit, tuned
+from offline.train import fit, with_bank
 from offline.validate import (
     LeftOut,
     Validation,
@@ -30,7 +30,7 @@ from offline.validate import (
 @pytest.fixture(autouse=True)
 def _few_settings(monkeypatch):
     """Try few settings of a bank, on few folds: the tests are about what is left out."""
-    monkeypatch.setattr(tuning, "BANK_SETTINGS", tuning.BANK_SETTINGS[1:2])
+    monkeypatch.setattr(bank_choice, "BANK_SETTINGS", bank_choice.BANK_SETTINGS[1:2])
     monkeypatch.setattr(validation, "MOST_FOLDS", 5)
 
 
@@ -39,7 +39,7 @@ def test_rules_gain_where_places_tell_the_sets_apart():
     np.testing.assert_allclose(validation.ratios["paper"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
     said = validation.verdict("paper")
     assert said.startswith("`paper`: expected gain 5")
-    assert "in other recordings (8 stretches of 8 recordings), adapting 100 %" in said
+    assert "in other recordings (8 segments of 8 recordings), adapting 100 %" in said
     # Without a bank, the fixed set is kept.
     assert validation.ratios["adaptive"].tolist() == [1.0] * 8
     assert "kept the fixed set" in validation.verdict("adaptive")
@@ -59,7 +59,7 @@ class Cheat(Rule):
     def predict(self, feature):
         raise NotImplementedError
 
-    def select(self, feature, live=NOTHING):  # noqa: ARG002
+    def select(self, feature, evidence=NOTHING):  # noqa: ARG002
         return Selection(0, {})
 
 
@@ -67,7 +67,7 @@ def test_a_selection_holds_for_its_second(monkeypatch):
     asked = []
 
     class Remember(Cheat):
-        def select(self, feature, live=NOTHING):  # noqa: ARG002
+        def select(self, feature, evidence=NOTHING):  # noqa: ARG002
             asked.append(feature)
             trial = TRIALS[len(asked) % 2]
             return Selection(trial, SETS[trial])
@@ -88,6 +88,11 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
         judged = [replace(s, values=np.array(value, float)) for s in sequences]
         data, _ = labelled(judged).training_data()
         assert data.fixed == labelled(judged).fixed() == TRIALS[expected]
+        # Rotation errors of blocks say nothing of such a value.
+        turning = [
+            replace(s, turns=np.ones_like(s.errors), block=np.arange(80) // 40) for s in judged
+        ]
+        assert labelled(turning).fixed() == TRIALS[expected]
 
 
 def test_validates_a_study(study_file, trained_folder, tmp_path):
@@ -99,11 +104,11 @@ def test_validates_a_study(study_file, trained_folder, tmp_path):
     ends = ["cost [ms]", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
     assert rows[0]["adaptive"] == pytest.approx(validation.ratios["adaptive"][0])
-    # Four sub-trajectories tell nothing, nor do two stretches; a dozen would.
+    # Four sub-trajectories tell nothing, nor do two segments; a dozen would.
     assert len(validation.recordings) < MIN_BLOCKS
     assert [rows[i]["adaptive, 95 %"] for i in (0, 3, 4)] == ["too few", "too few", None]
     assert validation.left_out[0].span > 1
-    for name in ("validation.csv", "validation.svg", "stretches.csv"):
+    for name in ("validation.csv", "validation.svg", "segments.csv"):
         assert (study.folder / name).exists()
     other_range = "odometry.parameters.keyframe_interval.high=20"
     with pytest.raises(ConfigurationError, match=r"\.high changed from 15\.0 to 20"):
@@ -135,7 +140,7 @@ def judged(data, study, monkeypatch, given=()):
     """What `validate` says of a model that is fitted to these data, and the model."""
     switching = SwitchingConfig(size=3)
     model = fit(data, data.fixed(), {}, 10.0, 1, {})
-    model = tuned(replace(model, blocks={"ndt": 90}), data, switching)
+    model = with_bank(replace(model, blocks={"ndt": 90}), data, switching)
     model = replace(model, **dict(given))
     its_own = replace(model, sequences=study.training, window=study.window)
     monkeypatch.setattr(type(study), "model", lambda _: its_own)
@@ -163,18 +168,18 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     better = replace(model, recommended="adaptive")
     said = driven(better, study.config.online, study.odometry, study.mechanism)
     assert said.startswith(f"Recommended: adaptive, the bank of trials {bank}: expected gain")
-    assert "what is left out, over 6 stretches (" in found.verdicts[2]
+    assert "what is left out, over 6 segments (" in found.verdicts[2]
     # Where it cannot be judged it says what is driven.
     alone = labelled(six.sequences[:1])
     for mechanism, why in (("bank", "With cores to spare: ad"), ("live", "names no bank")):
         given = [f"online.switching.mechanism={mechanism}", "online.switching.size=3"]
         study = load_study(study_file, given, tmp_path)
-        match = f"one stretch only, .* Recommended: trial .* {why}"
+        match = f"one segment only, .* Recommended: trial .* {why}"
         with pytest.raises(ValidationError, match=match):
             judged(alone, study, monkeypatch)
 
 
-def test_stretches_of_one_recording_are_left_out():
+def test_segments_of_one_recording_are_left_out():
     # 400 m, with sub-trajectories of 10 m.
     one = with_motions("one", np.random.default_rng(6), 1334)
     data = labelled([one])
@@ -182,14 +187,14 @@ def test_stretches_of_one_recording_are_left_out():
     assert [s.name for s in validation.left_out] == ["one"]
     assert len(validation.logs["adaptive"]) == len(validation.recordings) == 10
     assert validation.summary("adaptive")["geometric"] < 0.9
-    assert "elsewhere along this recording (10 stretches of one rec" in validation.verdict(
+    assert "elsewhere along this recording (10 segments of one rec" in validation.verdict(
         "adaptive"
     )
     (left_out,) = validation.left_out
-    np.testing.assert_array_equal(left_out.stretch, one.stretch)
-    # The fixed set is another one in each stretch; the errors are those of the whole recording.
+    np.testing.assert_array_equal(left_out.segment, one.segment)
+    # The fixed set is another one in each segment; the errors are those of the whole recording.
     for number, (left, others) in enumerate(data.folds()):
-        of = left_out.stretch == number
+        of = left_out.segment == number
         fixed = one.errors[of, SETS.column(others.fixed())]
         np.testing.assert_allclose(left_out.errors["fixed"][of], fixed, rtol=1e-6)
         assert len(left.errors) == of.sum()
@@ -199,9 +204,9 @@ def test_stretches_of_one_recording_are_left_out():
     ("errors", "better"), [((0.5, 0.51), True), ((0.5, 1.0), False), ((1.5, 1.51), False)]
 )
 def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better):
-    one_stretch = np.zeros(9, int)
+    one_segment = np.zeros(9, int)
     left_out = [
-        LeftOut(*2 * [f"s{i}"], one_stretch, 1, {"baseline": of, "fixed": np.ones(9)}, {}, {})
+        LeftOut(*2 * [f"s{i}"], one_segment, 1, {"baseline": of, "fixed": np.ones(9)}, {}, {})
         for i, of in enumerate(np.outer(errors, np.ones(9)))
     ]
     said = baseline_in_words(Validation(left_out))
@@ -210,4 +215,4 @@ def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better)
     for one in left_out:
         one.errors["baseline"] = one.errors["fixed"]
     said = baseline_in_words(Validation(left_out))
-    assert said == "Without what is left out, the baseline is chosen each time, over 2 stretches."
+    assert said == "Without what is left out, the baseline is chosen each time, over 2 segments."

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from commands import succeeded
 
-from adaptune.archive import Archive
+from adaptune._system.progress import unseen
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.progress import unseen
+from adaptune.runs.archive import Archive
 from offline.config import load_study
-from offline.train import odometry_rows, oracle_sets, run_oracle, train
+from offline.train import oracle_sets, run_odometries, run_oracle, train
 from online.modes import Replays, replay_modes
 
 N = 5
@@ -109,7 +109,7 @@ def test_each_of_several_odometries_is_run_on_the_test(study_file, tmp_path):
     overrides = [f"odometry=[{two}]", "offline.trials=5", "offline.initial=5"]
     study = load_study(study_file, overrides, tmp_path)
     training = train(study)
-    rows = odometry_rows(study, training)
+    rows = run_odometries(study, training)
     tested = [row["test [%]"] for row in rows]
     assert tested == sorted(tested)
     assert {(row["odometry"], row["set"]) for row in rows} >= {
@@ -122,6 +122,6 @@ def test_each_of_several_odometries_is_run_on_the_test(study_file, tmp_path):
     errors = cap(archive.read_errors("three", [best["_trial"]]))
     assert best["test [%]"] == pytest.approx(np.nanmean(errors))
     # What is there is not run again, and a single odometry has no such rows.
-    assert odometry_rows(study, training) == rows
+    assert run_odometries(study, training) == rows
     alone = [row for row in training.trials if row["odometry"] == "one"]
-    assert odometry_rows(study, training._replace(trials=alone)) == []
+    assert run_odometries(study, training._replace(trials=alone)) == []

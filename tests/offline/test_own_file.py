@@ -1,7 +1,7 @@
 import pytest
 from drives import study_with
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.space import ODOMETRY
 from adaptune.study.driven import ANY, EQUAL, FILES
 from adaptune.tuning.verdict import front_table

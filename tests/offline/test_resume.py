@@ -8,9 +8,9 @@ import drives
 import numpy as np
 import pytest
 
+from adaptune._system.strict import ConfigurationError
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.train import train
 

@@ -6,12 +6,12 @@ import fake_odometry
 import numpy as np
 import pytest
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel, Rule
 from adaptune.model.knn import NearestNeighbours
 from adaptune.model.rules import BASELINE
+from adaptune.runs.archive import PREPARE_MS, REGISTER_MS, Archive
 from adaptune.space import Selection
 from offline.config import load_study
 from offline.scenario import read_scenario, scenario, write_scenario
@@ -45,7 +45,7 @@ def test_it_holds_what_the_archive_does(study):
     # All are prepared alike, so that this costs the same.
     costs = register.mean(axis=1) + np.median(prepare.mean(axis=1))
     np.testing.assert_allclose(found.cost, costs)
-    # Two recordings are few: stretches are left out, and none is of both.
+    # Two recordings are few: segments are left out, and none is of both.
     folds = [set(found.fold[found.sequence == name]) for name in ("one", "two")]
     assert folds[0].isdisjoint(folds[1])
     assert found.features.shape == (58, 90)
@@ -56,23 +56,23 @@ class Baseline(Rule):
         self.data = data
         return self
 
-    def select(self, feature, live=None):  # noqa: ARG002
+    def select(self, feature, evidence=None):  # noqa: ARG002
         return Selection(BASELINE, self.data.sets[BASELINE])
 
 
 class Fixed(Baseline):
-    def select(self, feature, live=None):  # noqa: ARG002
+    def select(self, feature, evidence=None):  # noqa: ARG002
         return Selection(self.data.fixed, self.data.sets[self.data.fixed])
 
 
 class Cheapest(Baseline):
-    def select(self, feature, live=None):  # noqa: ARG002
+    def select(self, feature, evidence=None):  # noqa: ARG002
         best = min(self.data.candidates or self.data.sets, key=self.data.costs.alone)
         return Selection(best, self.data.sets[best])
 
 
 class Outside(Baseline):
-    def select(self, feature, live=None):  # noqa: ARG002
+    def select(self, feature, evidence=None):  # noqa: ARG002
         other = next(trial for trial in self.data.sets if trial not in self.data.candidates)
         return Selection(other, self.data.sets[other])
 
@@ -80,7 +80,7 @@ class Outside(Baseline):
 class Best(Baseline):
     """Sees the error of the very frame, which no fold that is left out may show."""
 
-    def select(self, feature, live=None):  # noqa: ARG002
+    def select(self, feature, evidence=None):  # noqa: ARG002
         (frame,) = np.flatnonzero((self.data.features == feature).all(axis=1))
         return Selection(self.data.sets.trials[frame], self.data.sets[0])
 
@@ -94,9 +94,9 @@ def test_a_table_of_rules_has_what_they_compare_with(study):
     rows = {row["rule"]: row for row in found.score(Baseline(), Fixed())}
     assert list(rows) == ["Baseline", "Fixed", "fixed", "best single set", "oracle"]
     some = [found.sets.column(trial) for trial in found.candidates]
-    capped = cap(found.performances)[:, some]
-    assert rows["oracle"]["RTE [%]"] == pytest.approx(capped.min(axis=1).mean())
-    assert rows["best single set"]["RTE [%]"] == pytest.approx(capped.mean(axis=0).min())
+    clipped = cap(found.performances)[:, some]
+    assert rows["oracle"]["RTE [%]"] == pytest.approx(clipped.min(axis=1).mean())
+    assert rows["best single set"]["RTE [%]"] == pytest.approx(clipped.mean(axis=0).min())
     assert rows["Fixed"] | {"rule": "fixed"} == rows["fixed"]
     assert rows["fixed"]["vs fixed"] == 1.0
     assert rows["Baseline"]["cost [ms]"] == pytest.approx(found.cost[0])
@@ -139,7 +139,7 @@ def test_rules_are_scored_without_an_odometry(study):
 
 def test_a_bank_is_not_scored(study):
     class Bank(Baseline):
-        def select(self, feature, live=None):  # noqa: ARG002
+        def select(self, feature, evidence=None):  # noqa: ARG002
             return super().select(feature)._replace(weights={0: 1.0})
 
     with pytest.raises(AdaptuneError, match=r"Bank: weighs a bank: .* `adaptune validate`"):

@@ -5,11 +5,11 @@ import pytest
 from made_trials import Drawn
 from rooms import along_x
 
-from adaptune.archive import Archive, Frames
+from adaptune.runs.archive import Archive, Frames
 from offline.campaign import Schedule
 from offline.config import load_study
 
-STRETCHES = [[0, 2, 12], [14, 16, 26], [28, 30, 40]]
+SEGMENTS = [[0, 2, 12], [14, 16, 26], [28, 30, 40]]
 CUT = Frames(
     np.arange(40) * 10**8,
     along_x(0.3 * np.arange(40)),
@@ -17,7 +17,7 @@ CUT = Frames(
     {"ndt": 90},
     np.zeros(40, np.float32),
     evidence_ms=1.0,
-    stretches=np.array(STRETCHES),
+    segments=np.array(SEGMENTS),
 )
 
 
@@ -33,7 +33,7 @@ def schedule(study_file, tmp_path):
 
 
 def begins(*tasks):
-    return [task.stretch.first for task in tasks]
+    return [task.segment.first for task in tasks]
 
 
 def test_a_worker_goes_on_where_its_scans_are_and_else_where_nobody_is(schedule):
@@ -65,7 +65,7 @@ def test_sets_that_take_scans_alike_are_driven_together(schedule, study_file, tm
 
 
 class Slow(Drawn):
-    """Trial 1 is too slow along the first stretch."""
+    """Trial 1 is too slow along the first segment."""
 
     def wait(self):
         ((worker, drives),) = super().wait()
@@ -74,11 +74,11 @@ class Slow(Drawn):
         return [(worker, drives)]
 
 
-def test_trials_are_made_of_their_stretches_and_a_slow_set_is_driven_no_more(schedule):
+def test_trials_are_made_of_their_segments_and_a_slow_set_is_driven_no_more(schedule):
     pool = Slow(lambda _, parameters: parameters["keyframe_interval"] - 1.0)
     found = {number: trial for _, number, trial in schedule.run(pool)}
     assert sorted(found) == [0, 1, 2, 3]
-    driven = [task.stretch.first for task in pool.tasks if 1 in task.sets]
+    driven = [task.segment.first for task in pool.tasks if 1 in task.sets]
     assert driven == [0]
     assert found[1].failure.startswith("too slow: ")
     assert not found[2].failure

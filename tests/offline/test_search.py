@@ -8,7 +8,7 @@ import pytest
 from clocks import SteppedClock
 from made_trials import Drawn
 
-from adaptune.archive import Archive, Summary
+from adaptune.runs.archive import Archive, TrialSummary
 from adaptune.space import Categorical, Integer, ParameterSpace
 from offline import search
 from offline.campaign import FITTING, Campaign, Forecast
@@ -98,19 +98,19 @@ def test_sequences_are_added_and_removed(study_of, sampler):
     def run_on(names, trials, folder=None):
         study = study_of(folder, trials=trials, training=names, **given)
         pool = Drawn(error)
-        verdicts = Campaign(study, Archive(study.folder / "trials"), pool).run()
-        return study.folder, verdicts, {(t.sequence, n) for t in pool.tasks for n in t.sets}
+        judged = Campaign(study, Archive(study.folder / "trials"), pool).run()
+        return study.folder, judged, {(t.sequence, n) for t in pool.tasks for n in t.sets}
 
     folder, first, _ = run_on(["two", "one"], 10)
     before = sets(Archive(folder / "trials"))
-    _, verdicts, ran = run_on(NAMES, 10, folder)
+    _, judged, ran = run_on(NAMES, 10, folder)
     after = sets(Archive(folder / "trials"))
     assert before.items() <= after.items()
     assert {name for name, _ in ran} == {"three"}
-    assert list(verdicts) == list(first)
-    assert all(after["three", n] == before["one", n] for n in verdicts)
+    assert list(judged) == list(first)
+    assert all(after["three", n] == before["one", n] for n in judged)
     _, fewer, ran = run_on(["three"], 14, folder)
-    assert max(fewer) >= max(verdicts)
+    assert max(fewer) >= max(judged)
     _, _, ran = run_on(NAMES, 14, folder)
     everything = sets(Archive(folder / "trials"))
     assert after.items() <= everything.items()
@@ -121,7 +121,7 @@ def test_sequences_are_added_and_removed(study_of, sampler):
 
 
 def summary(parameters, value=1.0, failure=""):
-    return Summary(parameters, value, 0, 0, 1.0, failure=failure)
+    return TrialSummary(parameters, value, 0, 0, 1.0, failure=failure)
 
 
 def searched(config, space, errors, hours=0.0, known=None):
@@ -137,7 +137,7 @@ LETTERS = ParameterSpace({"k": Categorical(choices=("a", "b", "c"), baseline="a"
 COUNT = ParameterSpace({"k": Integer(low=1, high=1000, baseline=1)})
 
 
-def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
+def test_values_belong_to_their_trials_where_numbers_are_left_out():
     config = OfflineConfig(trials=8, initial=2, batch=2)
     # Trial 3 is known from another sequence.
     known = {0: summary({"k": "a"}), 3: summary({"k": "b"})}
@@ -191,8 +191,7 @@ def test_the_clock_goes_on_counting(tmp_path):
     clock = Stopwatch(path)
     clock.save()
     assert 0.0 < Stopwatch(path).hours < 0.1
-    # By batch, as earlier versions kept it.
-    path.write_text('{"0": 3600, "1": 1800.0}')
+    path.write_text('{"seconds": 5400.0}')
     assert 1.5 <= Stopwatch(path).hours < 1.6
     path.write_text("damaged")
     assert Stopwatch(path).hours < 0.1
@@ -219,15 +218,15 @@ def test_no_set_begins_that_would_not_end_in_time(study_of, monkeypatch, expecte
     clock.seconds = 100.0  # reading the bags
     given = Archive(study.folder / "trials"), Slow(clock)
     first = Campaign(study, *given, clock=of_study, expected=Forecast(expected, 10.0 * expected))
-    verdicts = first.run()
-    n = f"{len(verdicts)} parameter sets were tried, 1 of them the odometry's own"
+    judged = first.run()
+    n = f"{len(judged)} parameter sets were tried, 1 of them the odometry's own"
     assert first.words == [f"{n}: no more sets fit into the time."]
-    assert clock.seconds == 100.0 + 30.0 * len(verdicts)
+    assert clock.seconds == 100.0 + 30.0 * len(judged)
     assert 0.8 * 1500.0 <= clock.seconds + 300.0 + FITTING <= 1500.0
     # Nor if the same command, again, finds that one more would fit.
     again_clock = Stopwatch(study.folder / "elapsed.json")
     again = Campaign(study, *given, clock=again_clock, expected=Forecast(1.0, 1.0))
-    assert again.run().keys() == verdicts.keys()
+    assert again.run().keys() == judged.keys()
 
 
 def test_however_short_the_time_the_baseline_is_driven(study_file, tmp_path, caplog):

@@ -11,18 +11,18 @@ from setups import made_of, setup_of
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
-from adaptune.metrics import sub_trajectory_rte
+from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.odometry import Registration
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.recording import SequenceConfig
 from adaptune.recording.scan import Scan, SequenceError
+from adaptune.reference.judge import Reference
+from adaptune.runs.loop import replay
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineConfig, load_study
-from offline.frames import reference_poses
+from offline.frames import Segment, reference_poses, segments_of
 from offline.shared_scans import SharedScans
-from offline.stretches import Stretch, stretches_of
-from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 
@@ -34,8 +34,8 @@ def study(study_file, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def short(study_file, tmp_path_factory):
-    """The same with four stretches of each sequence."""
-    given = ["sub_trajectory=0.3", "offline.stretches=4"]
+    """The same with four segments of each sequence."""
+    given = ["sub_trajectory=0.3", "offline.segments=4"]
     return load_study(study_file, given, tmp_path_factory.mktemp("run"))
 
 
@@ -44,23 +44,13 @@ def test_a_good_trial(study):
     (trial,) = trials_of(setup_of(study), [GOOD], frames=frames)
     assert trial.parameters == GOOD
     assert not trial.restarted.any()
-    assert trial.registered.all()
+    assert not trial.failure
     assert trial.mean_error < 2.0
     # 39 steps of 0.3 m: sub-trajectories of more than 3 m start at the first 29 frames. It begins
     # in motion, and counts from there, as a replay does.
     assert np.flatnonzero(~np.isnan(trial.errors)).tolist() == list(range(29))
     expected = sub_trajectory_rte(frames.counted, trial.T_odom_sensor, 3.0)
     np.testing.assert_array_equal(trial.errors, expected)
-
-
-def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_path):
-    study = load_study(study_file, ["descriptor=[ndt, motion]"], tmp_path)
-    frames = described(setup_of(study))
-    assert frames.blocks == {"ndt": 90, "motion": 2}
-    np.testing.assert_allclose(frames.descriptors[:2, 90], 0.0)
-    # 0.3 m a scan, ten scans a second.
-    np.testing.assert_allclose(frames.descriptors[2:, 90], 3.0, rtol=0.1)
-    assert frames.descriptors[:, :90].any()
 
 
 def test_trials_side_by_side_are_those_one_by_one(study):
@@ -104,7 +94,7 @@ def test_a_trial_is_a_drive_with_the_health_check(study):
     (trial,) = trials_of(setup, [GOOD], frames=frames)
     scans = study.sequences.open("one")
     replayed = replay(scans, made_of(Lost, study)(GOOD), study.config.health)
-    assert trial.unhealthy == replayed.unhealthy == {"max_speed": 1}
+    assert replayed.unhealthy == {"max_speed": 1}
     np.testing.assert_array_equal(trial.T_odom_sensor, replayed.trajectory.T_world_sensor)
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     assert np.isfinite(trial.errors[8:29]).all()
@@ -112,16 +102,33 @@ def test_a_trial_is_a_drive_with_the_health_check(study):
     np.testing.assert_array_equal(whole.T_odom_sensor, trial.T_odom_sensor)
 
 
-def test_each_stretch_begins_at_the_reference_and_in_motion(short):
+def test_a_trial_and_a_replay_have_the_same_errors_but_for_the_warm_up(short):
+    scans = short.sequences.open("one")
+    run = replay(scans, short.odometry(GOOD), short.config.health)
+    expected = Reference(scans.reference(), 0.3).errors(run.trajectory)
+    frames = described(setup_of(short))
+    (whole,) = trials_of(setup_of(short), [GOOD], frames=frames.uncut)
+    np.testing.assert_array_equal(cap(whole.errors), expected)
+    # A segment within the recording begins at the reference, and its first scans do not count.
+    (trial,) = trials_of(setup_of(short), [GOOD], frames=frames)
+    (_, _, end), (first, begin, _), *_ = frames.segments
+    known = np.flatnonzero(np.isfinite(trial.errors[:end]))
+    np.testing.assert_array_equal(cap(trial.errors[known]), expected[known])
+    assert first < begin
+    assert np.isnan(trial.errors[first:begin]).all()
+    assert np.isfinite(expected[first:begin]).all()
+
+
+def test_each_segment_begins_at_the_reference_and_in_motion(short):
     instances = []
     setup = setup_of(short, made_of(Slipping, short, instances))
     frames = described(setup)
     (trial,) = trials_of(setup, [GOOD], frames=frames)
-    stretches = frames.stretches
-    assert len(stretches) == 4
+    segments = frames.segments
+    assert len(segments) == 4
     T_ref_sensor, starts = frames.T_ref_sensor, [one.starts[0] for one in instances]
     assert len(starts) == 4
-    for (first, begin, end), (_, T, motion) in zip(stretches[1:], starts[1:], strict=True):
+    for (first, begin, end), (_, T, motion) in zip(segments[1:], starts[1:], strict=True):
         np.testing.assert_array_equal(T, T_ref_sensor[first])
         np.testing.assert_allclose(
             motion, invert(T_ref_sensor[first - 1]) @ T_ref_sensor[first], atol=1e-3
@@ -136,7 +143,7 @@ def test_each_stretch_begins_at_the_reference_and_in_motion(short):
 
 
 class FailsOnce(KeyframeGicp):
-    """Cannot begin on its second stretch."""
+    """Cannot begin on its second segment."""
 
     made: ClassVar = []
 
@@ -151,23 +158,23 @@ def test_a_drive_that_fails_at_its_first_scan_counts_as_lost(short):
     setup = setup_of(short, made_of(FailsOnce, short))
     frames = described(setup)
     (trial,) = trials_of(setup, [GOOD], frames=frames)
-    for i, (_, begin, end) in enumerate(frames.stretches):
+    for i, (_, begin, end) in enumerate(frames.segments):
         known = trial.errors[begin:end][~np.isnan(trial.errors[begin:end])]
         assert len(known)
         assert np.isinf(known).all() == (i == 1)
-    assert "seven planes" in trial.faults[0]
+    assert "seven planes" in trial.reasons[0]
     assert trial.failure.startswith("no pose for ")
 
 
 @pytest.mark.parametrize(
     ("metres", "n", "many"), [(400.0, 12, 12), (120.0, 12, 1), (400.0, None, 1)]
 )
-def test_stretches_are_spread_evenly_along_the_path(metres, n, many):
+def test_segments_are_spread_evenly_along_the_path(metres, n, many):
     stamps = np.arange(4000) * 10**8
     T = np.tile(np.eye(4), (4000, 1, 1))
     # It stands for half of the time.
     T[:, 0, 3] = np.concatenate([np.zeros(2000), np.linspace(0.0, metres, 2000)])
-    found = stretches_of(T, stamps, 5.0, n)
+    found = segments_of(T, stamps, 5.0, n)
     assert len(found) == many
     if many == 1:
         assert found.tolist() == [[0, 0, 4000]]
@@ -179,14 +186,14 @@ def test_stretches_are_spread_evenly_along_the_path(metres, n, many):
     assert ends[-1] > 3950
     np.testing.assert_allclose(np.diff(T[begins, 0, 3]), (metres - 15.15) / 11, atol=0.3)
     # The same number of sub-trajectories begins along each.
-    of_stretch = T[ends - 1, 0, 3] - T[begins, 0, 3]
-    np.testing.assert_allclose(of_stretch, 15.1, atol=0.3)
+    of_segment = T[ends - 1, 0, 3] - T[begins, 0, 3]
+    np.testing.assert_allclose(of_segment, 15.1, atol=0.3)
 
 
 def test_a_recording_that_begins_in_motion_counts_from_its_first_scan():
     stamps, T = np.arange(200) * 10**8, np.tile(np.eye(4), (200, 1, 1))
     T[:, 0, 3] = 0.3 * np.arange(200)
-    assert stretches_of(T, stamps, 5.0, None).tolist() == [[0, 0, 200]]
+    assert segments_of(T, stamps, 5.0, None).tolist() == [[0, 0, 200]]
 
 
 class Slow(KeyframeGicp):
@@ -198,9 +205,9 @@ def test_a_set_that_is_too_slow_is_stopped(study):
     (slow,) = trials_of(setup, [GOOD], most=0.0)
     (good,) = trials_of(setup, [GOOD], most=1e6)
     (ms,) = re.findall(r"too slow: (\d+) ms a scan", slow.failure)
-    assert int(ms) == round(slow.usage["register_ms"])
+    assert int(ms) == round(slow.others["register_ms"])
     assert int(ms) < 1e3  # of the one scan that it was given
-    assert not slow.registered[2:].any()
+    assert (slow.T_odom_sensor[2:] == slow.T_odom_sensor[1]).all()
     # Wherever it is stopped, it has the same errors.
     np.testing.assert_array_equal(np.isinf(slow.errors), np.isfinite(good.errors))
     assert not good.failure
@@ -252,13 +259,13 @@ def test_an_exception_is_a_fault_of_its_trial(study, where):
     frames = described(setup)
     sets = [GOOD | {"keyframe_interval": 7.0}, GOOD]
     bad, good = trials_of(setup, sets, frames=frames)
-    (fault,) = bad.faults
+    (fault,) = bad.reasons
     assert "ValueError: seven planes" in fault
     assert not good.faults
     first = 20 if where == "register" else 1
-    assert not bad.registered[first:].any()
-    assert bad.unhealthy["no_pose"] == len(bad.errors) - first + (where != "register")
-    assert bad.failure.startswith("no pose for ")
+    assert (bad.T_odom_sensor[first:] == bad.T_odom_sensor[first - 1]).all()
+    n = len(bad.errors)
+    assert bad.failure == f"no pose for {n - first + (where != 'register')} of {n} scans"
     assert bad.mean_error > good.mean_error
 
 
@@ -344,13 +351,13 @@ class Read:
 
 
 def along(first=0):
-    return Stretch("one", first, np.arange(first, N), np.eye(4), None)
+    return Segment("one", first, np.arange(first, N), np.eye(4), None)
 
 
-def passes(shared, read, *instances, stretch=None):
+def passes(shared, read, *instances, segment=None):
     """What each instance gets on a pass."""
-    stretch = stretch or along()
-    return [[int(scan(one)[0]) for one in instances] for scan in shared.along(stretch, read)]
+    segment = segment or along()
+    return [[int(scan(one)[0]) for one in instances] for scan in shared.along(segment, read)]
 
 
 def test_each_scan_is_prepared_once_for_all_that_are_alike():
@@ -363,8 +370,8 @@ def test_each_scan_is_prepared_once_for_all_that_are_alike():
     assert passes(shared, read, alike, other) == [[i, i] for i in range(N)]
     assert (one.count, other.count, read.count) == (N, N, N)
     assert shared.nbytes == 2 * N * SIZE
-    # Only the scans of a stretch are read.
-    assert passes(shared, read, one, stretch=along(3)) == [[3], [4]]
+    # Only the scans of a segment are read.
+    assert passes(shared, read, one, segment=along(3)) == [[3], [4]]
     assert read.count == N + 2
 
 
@@ -403,26 +410,26 @@ def test_what_is_driven_by_turns_and_does_not_fit_together_stays():
 
 
 def test_scans_that_are_others_than_before_are_refused():
-    stretch = along()._replace(stamps=np.array([0, 1, 3, 9]))
+    segment = along()._replace(stamps=np.array([0, 1, 3, 9]))
     with pytest.raises(SequenceError, match="read: has other scans than before; run the same"):
-        passes(SharedScans(1e6), Read(), Preparer("a"), stretch=stretch)
+        passes(SharedScans(1e6), Read(), Preparer("a"), segment=segment)
 
 
 @pytest.mark.parametrize(
     ("name", "offline", "n"),
     [
         ("gicp", {}, 6),
-        ("gicp", {"stretches": 100}, 50),
-        ("gicp", {"stretches": 2}, 4),
-        ("gicp", {"stretches": "all"}, None),
+        ("gicp", {"segments": 100}, 50),
+        ("gicp", {"segments": 2}, 4),
+        ("gicp", {"segments": "all"}, None),
         ("gicp", {"objective": "kitti"}, None),
         ("command", {}, None),
     ],
 )
-def test_how_many_stretches_are_driven(study_file, name, offline, n):
+def test_how_many_segments_are_driven(study_file, name, offline, n):
     config = load_study(study_file).config
     odometry = config.odometry.model_copy(update={"name": name})
     given = OfflineConfig.model_validate(offline)
     changed = config.model_copy(update={"odometry": odometry, "offline": given})
-    assert changed.stretches == n
-    assert changed.search_inputs["stretches"] == (n or "all")
+    assert changed.segments == n
+    assert changed.search_inputs["segments"] == (n or "all")

@@ -3,15 +3,15 @@
 import fragile
 import pytest
 
-from adaptune.archive import Archive, Summary
 from adaptune.model.knn import NearestNeighbours
+from adaptune.runs.archive import Archive, TrialSummary
 from offline.config import OfflineConfig, load_study
 from offline.objective import judge, sampler_results
 from offline.train import train
 from offline.validate import validate
 
-GOOD = Summary({"x": 1}, 2.0, 0, 0, 10.0)
-FAILS = [Summary({"x": 2}, 1.0, 0, 10, 0.01, failure=why) for why in ("10 faults", "too slow")]
+GOOD = TrialSummary({"x": 1}, 2.0, 0, 0, 10.0)
+FAILS = [TrialSummary({"x": 2}, 1.0, 0, 10, 0.01, failure=why) for why in ("10 faults", "too slow")]
 FAST = "offline.objective={rte: 0.001, ms_per_scan: 1.0}"
 
 
@@ -63,7 +63,7 @@ def test_where_all_others_fail_the_baseline_is_left(study_file, tmp_path):
 @pytest.mark.parametrize("fails", FAILS)
 def test_a_set_that_fails_on_one_sequence_is_not_usable(fails):
     of = OfflineConfig(objective="ms_per_scan")
-    good, bad = judge(of, [GOOD, GOOD]), judge(of, [GOOD, fails])
+    good, bad = (judge(of, {"one": GOOD, "two": two}) for two in (GOOD, fails))
     assert (good.state, bad.state) == ("complete", f"failed: {fails.failure}")
     # Samplers are told that it is bad.
     (_, own), (_, worse) = sampler_results([good, bad])

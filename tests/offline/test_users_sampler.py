@@ -2,8 +2,8 @@ import re
 
 import pytest
 
+from adaptune._system.strict import ConfigurationError
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, SamplerError, load_study
 from offline.samplers import make_sampler
 

@@ -11,15 +11,15 @@ import pytest
 from made_replays import folder_of
 from typer.testing import CliRunner
 
+from adaptune._system.progress import unseen
 from adaptune.commands.cli import app
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
-from adaptune.progress import unseen
+from adaptune.runs.files import StoredReplayError
 from adaptune.study.config import ALSO
 from offline.config import load_study
 from online.compare import compare, compared_modes
 from online.modes import MODES, Replays, replay_modes, run_replays, run_untrained
-from online.record import StoredReplayError
 
 EVERY = list(MODES)
 

@@ -9,19 +9,20 @@ import drives
 import numpy as np
 import pytest
 from made_replays import folder_of
+from tables import with_run
 
-from adaptune import manifest
+from adaptune._system import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import LOST_ABOVE
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import mean_errors
+from adaptune.runs.files import StoredReplayError, read_run
 from adaptune.study import driven
 from adaptune.study.driven import ModeError, another_odometry, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
 from online.compare import NONE, compare
 from online.modes import run_replays
-from online.record import StoredReplay, StoredReplayError
 from online.reference import read_reference, reference_folder
 from online.statistics import ComparisonRow
 from online.verdict import remarks
@@ -144,7 +145,7 @@ def test_values_that_stay_read_as_those_that_change(own):
     path = folder_of(own, "fixed") / manifest.FILE
     parameters = {"mode": True, "size": 3, "kernel": "none"}
     manifest.record(path, manifest.recorded(path) | {"parameters": parameters})
-    choices = StoredReplay.read(path.parent).choices
+    choices = read_run(path.parent).values
     assert choices == {"mode": ["True"], "size": [3.0], "kernel": ["none"]}
 
 
@@ -239,7 +240,7 @@ def test_frames_in_a_gap_of_the_reference_have_no_error(own, study_file, tmp_pat
         given = [f"reference={tmp_path}/gap.tum", f"max_gap={max_gap}"]
         study = load_study(study_file, [f"sequences.three.{one}" for one in given], own.folder)
         run_replays(study, study.model_path)
-        stamps = StoredReplay.read(folder_of(own, "fixed")).trajectory.stamps
+        stamps = read_run(folder_of(own, "fixed")).trajectory.stamps
         in_training = np.isnan(study.sequences.open("three").reference().at(stamps)[:, 0, 0])
         assert np.count_nonzero(in_training) == unknown
         compared = np.isnan(read_reference(study, "three").trajectory.at(stamps)[:, 0, 0])
@@ -315,19 +316,19 @@ def test_a_damaged_replay_is_named(replayed, file, text):
 
 def rows_of(sequence="a", **ratios):
     return [
-        ComparisonRow(sequence, mode, ratio, ratio, 0, 0, 0)
+        ComparisonRow(sequence, mode, ratio, ratio)
         for mode, ratio in (ratios | {"fixed": 1.0}).items()
     ]
 
 
 def test_restarts_are_told_with_their_reason():
     baseline, fixed = rows_of(baseline=1.0)
-    once = {"restarts": 1, "first_restart": 10.12, "unhealthy": ("max_acceleration",)}
-    both = [replace(baseline, **once), replace(fixed, **once)]
+    once = {"restarts": 1, "unhealthy": {"max_acceleration": 1}}
+    both = [with_run(replace(row, first_restart=10.12), **once) for row in (baseline, fixed)]
     said = "On a the health check restarted all modes at 10.1 s (max_acceleration)."
     assert remarks(both)[-1] == said
-    more = once | {"restarts": 3, "unhealthy": ("max_speed", "max_turn_rate")}
-    assert remarks([replace(baseline, **more), both[1]])[-1] == (
+    more = {"restarts": 3, "unhealthy": {"max_speed": 1, "max_turn_rate": 2}}
+    assert remarks([with_run(both[0], **more), both[1]])[-1] == (
         "On a the health check restarted baseline 3 times, first at 10.1 s (max_speed, "
         "max_turn_rate); fixed at 10.1 s (max_acceleration)."
     )

@@ -8,7 +8,7 @@ from online.statistics import ComparisonRow
 
 def row(sequence, mode, ratio, low=None, high=None, other="fixed"):
     ends = None if low is None else (low, high)
-    return ComparisonRow(sequence, mode, 1.0, ratio, 0, 0, 0, ratio_interval=ends, yardstick=other)
+    return ComparisonRow(sequence, mode, 1.0, ratio, ratio_interval=ends, yardstick=other)
 
 
 ROWS = [

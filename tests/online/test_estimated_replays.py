@@ -6,7 +6,7 @@ import os
 import estimates
 import pytest
 
-from adaptune.machine import shared_cores
+from adaptune._system.machine import shared_cores
 from adaptune.paired import Ratio
 from adaptune.reference.estimated import EstimateError
 from offline.config import load_study
@@ -37,7 +37,7 @@ def test_it_is_estimated_and_said_to_judge(load, monkeypatch):
     assert written[1]["reference_error"] == rows[1].reference_error
     (table, *_) = tables(rows, 3.0)
     assert "reference" in table.rows[0]
-    assert "pulls ratios towards 1" in table.caption
+    assert "is wrong itself" in table.caption
     assert "On three an estimated reference judged: its own error is about 0.31 %." in remarks(rows)
     assert run_untrained(study) == 0
     # As if it were long enough for intervals.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adaptune.paired import Pair
-from online.gate import RESTARTS, Paired, Shared, compare_sides
+from online.gate import RESTARTS, PairedReplays, SharedReplays, compare_sides
 from online.statistics import ALL
 from online.turns import COST
 
@@ -19,14 +19,14 @@ def paired(i, *, ratio=1.0, restarts=(0, 0), lost=(0, 0), recording=None, seed=0
     summary = SimpleNamespace(scans=200, lacking=0)
     named = SimpleNamespace(name=f"drive_{i}", summary=summary)
     pair = Pair(errors, BLOCK, recording or f"content {i}")
-    return Paired((named, named), pair, np.arange(200.0), restarts, lost)
+    return PairedReplays((named, named), pair, np.arange(200.0), restarts, lost)
 
 
 def judge(pairs, costs=None):
     config = SimpleNamespace(sub_trajectory=2.0)
-    study = SimpleNamespace(odometry=SimpleNamespace(name="gicp"), config=config)
-    side = SimpleNamespace(name="side", study=study)
-    return compare_sides(Shared(side, side, "baseline", pairs, ""), costs, 0.05, 0.1)
+    odometry = SimpleNamespace(name="gicp")
+    side = SimpleNamespace(name="side", odometry=odometry, config=config)
+    return compare_sides(SharedReplays(side, side, "baseline", pairs, ""), costs, 0.05, 0.1)
 
 
 def of(gate, quantity):

@@ -5,7 +5,7 @@ from online.statistics import ORACLE, ComparisonRow, JudgedModes, oracle_row
 
 
 def judged(rte=1.0):
-    rows = [ComparisonRow("a", mode, rte, 1.0, 0, 0, 0) for mode in ("baseline", "fixed")]
+    rows = [ComparisonRow("a", mode, rte, 1.0) for mode in ("baseline", "fixed")]
     return JudgedModes("a", rows, {}, 1)
 
 
@@ -22,7 +22,7 @@ def test_the_best_set_of_the_sequence():
     assert oracle_row(judged(), oracle(errors), 9) is None
 
 
-def test_lost_tracks_are_capped_and_frames_without_errors_left_out():
+def test_lost_tracks_are_clipped_and_frames_without_errors_left_out():
     errors = [[np.inf, 0.5]] * 5 + [[0.1, 0.5]] * 5 + [[np.nan, np.nan]] * 5
     assert oracle_row(judged(2.0), oracle(errors), 1).rte == pytest.approx(2.0)
     # A lost track counts 30 %.

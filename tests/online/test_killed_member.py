@@ -14,9 +14,9 @@ from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import SERVICE, Limits
 from adaptune.recording import Scan
+from adaptune.runs.loop import replay
 from adaptune.selector import UntrainedSelector
 from adaptune.space import ParameterSets
-from online.replay import replay
 
 SETS = {
     3: {"odometry": "gicp", "max_correspondence_distance": 2.0},
@@ -44,7 +44,7 @@ def of_pool(*order):
         {n: OdometryFactory(n, {}, odometry_class(n).space, Limits()) for n in sorted(names)}
     )
     sets = {trial: pool.space.complete(SETS[trial]) for trial in order}
-    bank = Bank(pool, sets, 2.0)
+    bank = Bank(pool, sets)
     return bank, UntrainedSelector(ParameterSets(pool.space, order, tuple(sets.values())), 10.0)
 
 

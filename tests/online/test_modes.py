@@ -127,7 +127,7 @@ def test_a_program_that_runs_whole_recordings_has_none():
 def test_a_cheap_bank_runs_on_one_core(monkeypatch):
     monkeypatch.setattr("online.modes.available", lambda: 3)
     made = []
-    monkeypatch.setattr("online.modes.Bank", lambda *given: made.append(given[4]))
+    monkeypatch.setattr("online.modes.Bank", lambda *given: made.append(given[3]))
     model = replace(random_model(), bank_size=2)
     # Two members, which share what they prepare, and live evidence.
     for register, pace, cores in ((5.0, None, 1), (5.0, 3.0, 1), (5.0, 4.0, 3), (25.0, None, 3)):
@@ -136,6 +136,10 @@ def test_a_cheap_bank_runs_on_one_core(monkeypatch):
         given = setup("bank", size=2, real_time=in_real_time)
         given.instance(of(given, replace(model, costs=costs)).mode("adaptive"))
         assert made.pop() == cores, (register, pace)
+    # One that rests nearly always counts for nothing.
+    rests = BankSettings(reserve=1)
+    given.instance(of(given, replace(model, costs=costs, bank_settings=rests)).mode("adaptive"))
+    assert made.pop() == 1
     bank = setup("bank", size=2)
     bank.instance(of(bank, replace(model, costs=None)).mode("adaptive"))
     assert made == [3]

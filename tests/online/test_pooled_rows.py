@@ -15,7 +15,7 @@ def judged(name, ratio, rng, n=400, recording="", **more):
     errors = {"fixed": fixed, "adaptive": ratio * fixed * (1.0 + 0.1 * rng.standard_normal(n))}
     means = {mode: float(of.mean()) for mode, of in errors.items()}
     rows = [
-        ComparisonRow(name, mode, mean, mean / means["fixed"], 0, 2, 0, **more)
+        ComparisonRow(name, mode, mean, mean / means["fixed"], switches=2, **more)
         for mode, mean in means.items()
     ]
     return JudgedModes(name, rows, errors, BLOCK, recording)
@@ -89,10 +89,10 @@ def test_sequences_count_as_better_or_worse():
     assert (row.better, row.worse) == (2, 1)
 
 
-def test_the_worst_tenth_is_over_stretches_of_all_sequences():
+def test_the_worst_tenth_is_over_segments_of_all_sequences():
     found = of_ratios([0.5] * 9 + [2.0])
     assert adaptive(pooled(found)).worst_tenth == pytest.approx(2.0, rel=0.05)
-    # Five stretches of 80 frames in each sequence: a tenth of fifty are the last five.
+    # Five segments of 80 frames in each sequence: a tenth of fifty are the last five.
     found[-1].errors["adaptive"][:320] = found[-1].errors["fixed"][:320]
     expected = np.exp((np.log(2.0) + 4 * np.log(1.0)) / 5)
     row = adaptive(pooled(found))
@@ -103,7 +103,7 @@ def test_the_worst_tenth_is_over_stretches_of_all_sequences():
 
 def test_the_oracle_is_the_mean_of_the_best_set_of_each_sequence():
     found = of_ratios([0.8, 0.8])
-    best = [ComparisonRow(one.name, ORACLE, 0.6 * one.rows[0].rte, 0.6, 0, 0, 0) for one in found]
+    best = [ComparisonRow(one.name, ORACLE, 0.6 * one.rows[0].rte, 0.6) for one in found]
     rows = pooled(found, best)
     assert rows[-1].mode == ORACLE
     assert rows[-1].rte == pytest.approx(0.6 * rows[0].rte)

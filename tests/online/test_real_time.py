@@ -39,7 +39,7 @@ def scans(n, imu=False):
 class Steady:
     """An odometry that drives straight on, and takes its time."""
 
-    live, space = True, None
+    live, space, warm_up = True, None, 0.0
 
     def __init__(self, seconds=0.0, prepares=0.0):
         self.clock = SteppedClock()
@@ -79,7 +79,7 @@ class Answering:
     period: float = 1.0
 
     def __post_init__(self):
-        self.fixed = Selection(1, {"fine": 1})
+        self.fallback = Selection(1, {"fine": 1})
         self.turns = itertools.cycle((2, 1))
         self.shown = {}
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from made_replays import folder_of
 
-from adaptune import manifest
+from adaptune._system import manifest
 from adaptune.model import BankSettings, ErrorModel
+from adaptune.runs.files import read_run
 from offline.config import load_study
 from online.compare import compare
 from online.modes import run_replays
-from online.record import StoredReplay
 from online.verdict import remarks
 
 RATE = "online.real_time.rate=5"
@@ -56,12 +56,12 @@ def test_it_is_recorded_how_a_replay_kept_up(study):
 
 
 def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
-    in_real_time = StoredReplay.read(folder_of(study, "adaptive"))
+    in_real_time = read_run(folder_of(study, "adaptive"))
     overrides = ["online.modes=[adaptive]", BANK]
     lockstep = load_study(study_file, overrides, study.folder.parent / "lockstep")
     shutil.copytree(study.folder, lockstep.folder)
     assert run_replays(lockstep, lockstep.model_path) == 3  # those in real time are others
-    found = StoredReplay.read(folder_of(lockstep, "adaptive"))
+    found = read_run(folder_of(lockstep, "adaptive"))
     np.testing.assert_allclose(
         in_real_time.trajectory.T_world_sensor, found.trajectory.T_world_sensor, atol=1e-9
     )
@@ -70,7 +70,7 @@ def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
     assert found.summary.real_time is None
     # Both are there, and each is compared with its own.
     for one, pace in ((lockstep, None), (study, {5.0})):
-        of_rows = [row.real_time for row in compare(one).rows]
+        of_rows = [row.run.real_time for row in compare(one).rows]
         assert (
             all(of is None for of in of_rows)
             if pace is None
@@ -93,6 +93,6 @@ def test_replays_in_real_time_are_compared_as_they_are(study):
         (fixed / name).write_text("".join(lines[:-20] + lines[-19:]))
     rows = compare(study).rows
     assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive"]
-    assert {row.real_time["rate"] for row in rows} == {5.0}
+    assert {row.run.real_time["rate"] for row in rows} == {5.0}
     (found,) = [text for text in remarks(rows) if "too late" in text]
     assert "On three `fixed` was too late for 1 scan and 2 selections, at 5 times the" in found

@@ -15,14 +15,14 @@ from rosbags.highlevel import AnyReader
 from adaptune.geometry import invert
 from adaptune.model import BankSettings
 from adaptune.odometry.tracker import RegisteredScan
+from adaptune.runs.files import StoredReplayError, write_run
+from adaptune.runs.record import Choice, Run
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
 from online.modes import Replays
-from online.record import StoredReplayError, write_replay
 from online.recordings import record_replays, topic
 from online.reference import reference_folder, write_reference
-from online.replay import Choice, ReplayRecord
 
 N = 40
 STAMPS = drives.FIRST_STAMP + np.arange(N) * 100_000_000
@@ -42,7 +42,7 @@ def replay_of(trajectory, choices=(), **record):
             zip(trajectory.stamps.tolist(), trajectory.T_world_sensor, strict=True)
         )
     ]
-    made = ReplayRecord(steps=steps, cpu_ms=1.0, memory=1.0, **record)
+    made = Run(steps=steps, cpu_ms=1.0, memory=1.0, **record)
     for choice in choices:
         made.note(choice)
     return made
@@ -56,7 +56,7 @@ def selections():
             {"max_correspondence_distance": 1.0 + i, "kernel": ["none", "huber"][i % 2]},
             predicted_error=0.7,
             predicted_fixed=0.9,
-            familiarity=0.25,
+            similarity=0.25,
             weights={2: 0.75, 5: 0.25},
             estimated_error=estimated[0],
             estimated_low=estimated[1],
@@ -82,7 +82,7 @@ def study(study_file, tmp_path, monkeypatch):
         ("fixed", replay_of(along_x(0.01))),
         ("adaptive", replay_of(along_x(0.005), list(selections()), **in_time)),
     ):
-        write_replay(replays.folder("three", mode), made, replays.inputs("three", mode))
+        write_run(replays.folder("three", mode), made, replays.inputs("three", mode))
     elsewhere = np.eye(4)
     elsewhere[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     elsewhere[:3, 3] = 5.0, -3.0, 1.0
@@ -145,7 +145,7 @@ def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
     made, end = STAMPS[::10].tolist(), int(STAMPS[-1])
     assert numbers(found, "/adaptive/predicted_error") == (made, [0.7] * 4)
     assert numbers(found, "/adaptive/predicted_fixed_error") == (made, [0.9] * 4)
-    assert numbers(found, "/adaptive/familiarity") == (made, [0.25] * 4)
+    assert numbers(found, "/adaptive/similarity") == (made, [0.25] * 4)
     # What is not known yet is left out.
     assert numbers(found, "/adaptive/estimated_error") == (made[1:], [2.0, 3.0, 4.0])
     assert numbers(found, "/adaptive/estimated_error_high") == (made[1:], [3.0] * 3)

@@ -21,9 +21,7 @@ def test_errors_of_all_modes_are_drawn():
 
 
 def test_restarts_are_marked():
-    restarted = np.zeros(len(SECONDS), bool)
-    restarted[50] = True
-    (panel,) = error_chart(sequence(fixed=kept(), paper=replay(restarted=restarted))).panels
+    (panel,) = error_chart(sequence(fixed=kept(), paper=replay(restarted=[50]))).panels
     (last,) = of_kind(panel, Points)
     assert (last.name, list(last.x)) == ("restarted by the health check", [SECONDS[50]])
 
@@ -79,13 +77,34 @@ def test_what_no_mode_changes_is_not_drawn_and_members_are_told():
     assert choice_chart(sequence(fixed=kept())) is None
 
 
+def test_it_is_seen_when_members_work_are_lost_or_rest():
+    n = len(SECONDS)
+    of_17 = ["works"] * 50 + ["lost"] * 5 + ["rests"] * (n - 55)
+    weights = {"trial 4": [0.5] * 3, "trial 17": [0.5] * 3}
+    made = replay(weights=weights, members={"trial 4": ["works"] * n, "trial 17": of_17})
+    (panel,) = choice_chart(sequence(even=made)).panels
+    assert panel.y.names == ("trial 4", "trial 17")
+    always, at_first = of_kind(panel, Line)
+    # Until the next scan.
+    assert (np.isfinite(always.y).sum(), np.isfinite(at_first.y).sum()) == (n, 51)
+    (lost,) = of_kind(panel, Points)
+    np.testing.assert_allclose(lost.x, SECONDS[50:55])
+    np.testing.assert_array_equal(lost.y, 1.0)
+    made = replay(weights=weights, members={"trial 4": ["works"] * n, "trial 17": ["late"] * n})
+    (late,) = of_kind(choice_chart(sequence(even=made)).panels[0], Points)
+    assert late.name == "late, or removed"
+    np.testing.assert_allclose(late.x, SECONDS)
+    unknown = replay(weights=weights, members=dict.fromkeys(weights, [""] * n))
+    assert choice_chart(sequence(even=unknown)) is None
+
+
 def test_weights_that_never_change_are_not_drawn():
     even = replay(weights={"trial 4": [0.5] * 3, "trial 17": [0.5] * 3})
     assert choice_chart(sequence(adaptive=even)) is None
 
 
 def test_sets_of_several_odometries_leave_gaps():
-    mixed = {"odometry": ["gicp", "ndt", "ndt"], "resolution": [np.nan, 2.0, 2.0]}
+    mixed = {"odometry": ["gicp", "ndt", "ndt"], "resolution": [None, 2.0, 2.0]}
     mixed["kernel"] = ["huber", "", ""]
     panels = choice_chart(sequence(paper=replay(choices=mixed))).panels
     by_name = {panel.title: of_kind(panel, Line)[0] for panel in panels}

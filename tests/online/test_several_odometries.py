@@ -5,9 +5,9 @@ import csv
 import pytest
 from drives import study_with
 
-from adaptune import yaml12
-from adaptune.archive import Archive
+from adaptune._system import yaml12
 from adaptune.model import ErrorModel
+from adaptune.runs.archive import Archive
 from adaptune.space import ODOMETRY, PooledSpace
 from adaptune.study.driven import driven
 from offline.config import load_study
@@ -50,7 +50,7 @@ def test_the_trials_range_over_both(trained):
     for name in study.training:
         # The baselines of both are driven whole.
         for trial in (0, 1):
-            assert archive.read(name, trial, whole=True).parameters == sets[trial]
+            assert archive.read(name, trial, kind="whole").parameters == sets[trial]
             assert archive.finished(name)[trial].cost > 0.0
         assert archive.read_frames(name).evidence_ms > 0.0
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
@@ -84,7 +84,7 @@ def test_it_is_replayed_and_compared(trained):
     assert run_replays(study, study.model_path) == len(modes)
     rows = compare(study).rows
     assert list(dict.fromkeys(row.mode for row in rows)) == modes
-    assert all(row.cpu_ms > 0.0 and row.memory_mb > 0.0 for row in rows)
+    assert all(row.run.cpu_ms > 0.0 and row.run.memory_mb > 0.0 for row in rows)
     assert tables(rows, 3.0)
     assert not [said for said in remarks(rows) if "CPU time" in said]
     assert run_replays(study, study.model_path) == 0

@@ -9,9 +9,10 @@ import pytest
 from made_replays import folder_of
 from small_bag import replace_bag
 
+from adaptune._system.progress import unseen
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
-from adaptune.progress import unseen
+from adaptune.runs.files import StoredReplayError
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 from offline.train import train
@@ -19,7 +20,6 @@ from offline.validate import validate
 from online.charts import charts_of_replays
 from online.compare import compare
 from online.modes import Replays, replay_modes, run_replays
-from online.record import StoredReplayError
 from online.reference import CONTRADICTIONS, reference_folder
 from online.replayed import read_replays
 

@@ -1,8 +1,7 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from rooms import straight, trajectory
+from tables import with_run
 
 from adaptune.metrics import KittiError, kitti_error
 from adaptune.reference.judge import Reference, StandardErrors
@@ -17,7 +16,7 @@ def over_all(rows):
 
 
 def row(sequence, standard, mode="fixed"):
-    return ComparisonRow(sequence, mode, 1.0, 1.0, 0, 0, 0, standard=standard)
+    return ComparisonRow(sequence, mode, 1.0, 1.0, standard=standard)
 
 
 def test_errors_of_a_recorded_pair_are_those_of_evo_and_kitti(recorded):
@@ -67,13 +66,13 @@ def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
 
 
 def test_what_a_mode_costs_is_in_its_columns():
-    cells = replace(row("a", None), cpu_ms=12.5, memory_mb=300.0).columns()
+    cells = with_run(row("a", None), cpu_ms=12.5, memory_mb=300.0).columns()
     assert (cells["cost [ms]"], cells["memory [MB]"]) == (12.5, 300.0)
     old = row("a", None).columns()
     assert old["cost [ms]"] is old["memory [MB]"] is None
     costs = {"a": (10.0, 200.0), "b": (20.0, 400.0)}
-    rows = [replace(row(name, None), cpu_ms=ms, memory_mb=mb) for name, (ms, mb) in costs.items()]
+    rows = [with_run(row(name, None), cpu_ms=ms, memory_mb=mb) for name, (ms, mb) in costs.items()]
     of_all = over_all(rows)
-    assert of_all.cpu_ms == pytest.approx(15.0)
-    assert of_all.memory_mb == 400.0
-    assert over_all([row("a", None), row("b", None)]).cpu_ms is None
+    assert of_all.run.cpu_ms == pytest.approx(15.0)
+    assert of_all.run.memory_mb == 400.0
+    assert over_all([row("a", None), row("b", None)]).run.cpu_ms is None

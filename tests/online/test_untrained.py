@@ -8,14 +8,14 @@ import pytest
 from commands import refused, succeeded
 from made_replays import folder_of
 
-from adaptune import manifest, yaml12
+from adaptune._system import manifest, yaml12
 from adaptune.odometry.portfolio import read_portfolio
+from adaptune.runs.files import StoredReplayError, read_run
 from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.study.driven import ModeError
 from offline.config import load_study
 from online.compare import compare
 from online.modes import ReplaySetup, run_untrained, sequences_without_model
-from online.record import StoredReplay, StoredReplayError
 from online.reference import reference_folder
 from online.replayed import read_replays
 from online.tables import tables
@@ -122,9 +122,9 @@ def test_what_a_bank_measures_of_itself_is_kept_and_compared(load):
     assert [row["lost"] for row in rows] == ["0", "1", "0", "0"]
     summary = json.loads((folder / "replay.json").read_text())
     assert summary["lost_seconds"] == 1.0
-    stored = StoredReplay.read(folder)
+    stored = read_run(folder)
     np.testing.assert_array_equal(stored.estimated[1:], [[4, 3, 7], [6, 5, 9], [8, 7, 11]])
-    assert stored.lost.tolist() == [False, True, False, False]
+    assert [choice.selection.lost for choice in stored.choices] == [False, True, False, False]
     compared = compare(study).rows
     assert [row.mode for row in compared] == MODES
     assert compared[0].ratio == 1.0

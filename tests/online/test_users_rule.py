@@ -8,18 +8,18 @@ import pytest
 import users_rule
 from made_replays import folder_of
 
-from adaptune import manifest
+from adaptune._system import manifest
+from adaptune._system.strict import ConfigurationError
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import RuleError, rule_class
+from adaptune.runs.files import read_run
 from adaptune.selector import Selector
-from adaptune.strict import ConfigurationError
-from adaptune.tuning.tuned import compared
+from adaptune.tuning.tuned import write_comparison
 from offline.config import load_study
 from offline.scenario import scenario
 from offline.validate import validate
 from online.compare import compare
 from online.modes import run_replays
-from online.record import StoredReplay
 
 
 @pytest.fixture
@@ -40,11 +40,11 @@ def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path
     assert found.verdicts[-1].startswith(f"`{mode}`")
 
     run_replays(study, study.model_path)
-    replay = StoredReplay.read(folder_of(study, mode))
-    assert np.unique(replay.selections["trial"]).tolist() == [least]
+    replay = read_run(folder_of(study, mode))
+    assert np.unique([choice.selection.trial for choice in replay.choices]).tolist() == [least]
     assert run_replays(study, study.model_path) == 0
 
-    rows = compared(study)[0].rows
+    rows = write_comparison(study)[0].rows
     assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive", mode]
     monkeypatch.setattr("online.compare.decided", lambda *_: rows[-1])
     assert compare(study).advised == mode

@@ -1,5 +1,7 @@
 from dataclasses import replace
 
+from tables import with_run
+
 from adaptune.paired import Ratio
 from online.statistics import ALL, ORACLE, ComparisonRow
 from online.verdict import choices, decided, late, remarks, verdict
@@ -12,8 +14,9 @@ def rows_of(sequence=ALL, **ratios):
     for mode, ratio in ratios.items():
         to_own = ratio / ratios["baseline"]
         against = {"baseline": Ratio(to_own, (0.97 * to_own, 1.03 * to_own))}
-        row = ComparisonRow(sequence, mode, ratio, ratio, 0, 3, 0, against=against, cpu_ms=5.0)
-        rows.append(replace(row, ratio_interval=(0.97 * ratio, 1.03 * ratio)))
+        row = ComparisonRow(sequence, mode, ratio, ratio, switches=3, against=against)
+        row = replace(row, ratio_interval=(0.97 * ratio, 1.03 * ratio))
+        rows.append(with_run(row, cpu_ms=5.0))
     return rows
 
 
@@ -99,9 +102,9 @@ def test_a_bank_that_gains_nothing_is_not_offered():
 
 def test_what_may_be_driven_by_rising_budget_whatever_was_measured():
     rows = [
-        replace(row, cpu_ms=40.0) if row.mode == "adaptive" else row for row in every(adaptive=0.8)
+        with_run(row, cpu_ms=40.0) if row.mode == "adaptive" else row for row in every(adaptive=0.8)
     ]
-    rows = [replace(row, cpu_ms=4.5) if row.mode == "fixed" else row for row in rows]
+    rows = [with_run(row, cpu_ms=4.5) if row.mode == "fixed" else row for row in rows]
     found = choices(rows, front(), "fixed")
     keys = ("what", "trial", "error [%]", "cost [ms]", "driven on", "recommended", "file")
     assert [tuple(row[key] for key in keys) for row in found] == [
@@ -180,19 +183,34 @@ def test_why_nothing_adapts_is_told():
 
 
 def test_it_is_told_where_what_is_advised_comes_too_late():
-    rows = [replace(row, cpu_ms=120.0) for row in rows_of("slow", fixed=1.0, adaptive=0.9)]
-    rows += [replace(row, cpu_ms=20.0) for row in rows_of("fast", fixed=1.0, adaptive=0.9)]
+    rows = [with_run(row, cpu_ms=120.0) for row in rows_of("slow", fixed=1.0, adaptive=0.9)]
+    rows += [with_run(row, cpu_ms=20.0) for row in rows_of("fast", fixed=1.0, adaptive=0.9)]
     said = "On slow, scans come every 100 ms: 120 ms of CPU time a scan take several cores."
     assert late(rows, "fixed", {"slow": 100.0, "fast": 50.0}) == [said]
     assert not late(rows, "fixed", {"slow": 120.0, "fast": 50.0})
-    assert not late([replace(row, cpu_ms=None) for row in rows], "fixed", {"slow": 100.0})
+    assert not late([with_run(row, cpu_ms=None) for row in rows], "fixed", {"slow": 100.0})
+
+
+def test_it_is_told_where_what_is_advised_lost_scans_or_members_in_real_time():
+    kept = {"rate": 12.0, "dropped_scans": 3.0, "missed_selections": 0.0, "pose_ms_p99": 210.0}
+    of = {row.mode: row for row in rows_of("hall", fixed=1.0, adaptive=0.9)}
+    rows = [of["fixed"], with_run(of["adaptive"], real_time=kept | {"removed_members": 1.0})]
+    (said,) = late(rows, "adaptive", {})
+    assert said.startswith(
+        "On hall `adaptive` was too late for 3 scans and 1 of its members, which it went on "
+        "without, at 12 times the recorded rate; 99 % of its poses came within 210 ms"
+    )
+    assert not late(rows, "fixed", {})
+    rows[1] = with_run(rows[1], real_time=kept | {"dropped_scans": 0.0})
+    assert not late(rows, "adaptive", {})
 
 
 def test_a_bank_is_compared_with_even_weights_in_error_and_cost():
     against = {"even": Ratio(0.9, (0.8, 0.99))}
     costs = {"adaptive": 20.0, "even": 18.0}
     rows = [
-        replace(r, cpu_ms=costs.get(r.mode), against=against) for r in every(adaptive=0.8, even=0.9)
+        with_run(replace(row, against=against), cpu_ms=costs.get(row.mode))
+        for row in every(adaptive=0.8, even=0.9)
     ]
     assert (
         "`adaptive` has 0.90 times the error of the same bank with even weights (95 % interval "
@@ -224,7 +242,7 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
 
 
 def test_a_late_first_pose_is_told():
-    rows = [replace(row, first_pose=1.25) for row in rows_of("a", adaptive=0.5)]
+    rows = [with_run(row, first_pose=1.25) for row in rows_of("a", adaptive=0.5)]
     said = "On a the odometry gave its first pose after 1.2 s; errors count from there."
     assert said in remarks(rows)
 
@@ -241,7 +259,7 @@ def test_nothing_is_said_where_nothing_is_known():
     )
     assert remarks(rows) == []
     assert decided(rows) is None
-    oracle = ComparisonRow(ALL, ORACLE, 0.5, 0.5, 0, 0, 0)
+    oracle = ComparisonRow(ALL, ORACLE, 0.5, 0.5)
     assert not any(ORACLE in said for said in verdict([*every(adaptive=0.7), oracle], 10.0))
 
 

@@ -82,7 +82,7 @@ def test_what_was_told_is_kept_where_the_robot_goes_away(bag, monkeypatch):
     link = local_link.LocalLink(messages())
     link.close = lambda: None
     monkeypatch.setattr("adaptune.ros.ros2.local_ros2", lambda: link)
-    monkeypatch.setattr("online.live.SILENCE", 0.1)
+    monkeypatch.setattr("online.topics.SILENCE", 0.1)
     result = CliRunner().invoke(
         app, ["watch", "--ros2", "--points", "/points", "--odometry", "/odom"]
     )
@@ -145,7 +145,7 @@ def test_poses_that_come_late_are_told_in_words_of_a_listener(monkeypatch, caplo
     warn_once.cache_clear()
     monkeypatch.setattr(watch, "PATIENCE", 0.0)
     monkeypatch.setattr(watch, "WAITING", 0)
-    monkeypatch.setattr("online.live.SILENCE", 0.1)
+    monkeypatch.setattr("online.topics.SILENCE", 0.1)
     played = drives.scans(4, 30)
 
     def messages():

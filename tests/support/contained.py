@@ -14,11 +14,11 @@ from needs import reference_image
 from rooms import along_x
 
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.docker.engine import engine
-from adaptune.odometry.docker.rustle import RustleSettings
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.remote import Limits
+from adaptune.odometry.systems.engine import engine
+from adaptune.odometry.systems.rustle import RustleSettings
 from adaptune.recording import Scan
 
 LABEL = "adaptune.owner"

@@ -46,7 +46,7 @@ class Estimator:
 
 def install(monkeypatch, untrusted=()):
     """Let all references be estimated in this way, whatever was estimated before."""
-    monkeypatch.setattr(references, "KEPT", f"references-{secrets.token_hex(4)}")
+    monkeypatch.setattr(references, "ESTIMATES", f"references-{secrets.token_hex(4)}")
     monkeypatch.setattr(references, "_wholes", {})
     estimator = Estimator(untrusted)
     monkeypatch.setattr("adaptune.reference.estimate.estimate_reference", estimator)

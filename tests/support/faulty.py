@@ -31,7 +31,7 @@ class Faulty(Odometry):
 
     space = ParameterSpace({"x": Float(low=0.0, high=1.0, baseline=0.5)})
     settings_type = Settings
-    live = True
+    live, warm_up = True, 1.5  # seconds
 
     def __init__(self, *args):
         global n_instances  # noqa: PLW0603

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from wicked import children
 
-from adaptune.archive import Archive
 from adaptune.model import ErrorModel
+from adaptune.runs.archive import Archive
 
 PAUSE = 0.5
 """Seconds; about what a driver takes to start, or to end after its last trial."""

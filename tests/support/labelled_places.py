@@ -8,7 +8,7 @@ from tables import table
 
 from adaptune.live.hops import Hops
 from adaptune.metrics import sub_trajectory_vectors
-from offline.labelled import BankSimulation, LabelledData, LabelledSequence, stretches
+from offline.labelled import BankSimulation, LabelledData, LabelledSequence, segments
 
 TRIALS = (0, 3, 4, 7, 8)
 SETS = table(np.linspace(0.0, 1.0, 5)[:, None], TRIALS)
@@ -27,7 +27,7 @@ def sequence(name, means, kind, rng, n=80):
 
 
 def of_errors(name, errors, histograms=None, **more):
-    """A sequence of one stretch along x with these errors, on which no motions are known."""
+    """A sequence of one segment along x with these errors, on which no motions are known."""
     n = len(errors)
     described = np.zeros((n + 34, 90))
     described[:n] = 0.0 if histograms is None else histograms
@@ -50,8 +50,8 @@ def simulated(described, motions, T_ref_sensor=None):
 def in_place(name, simulation, known, errors, **more):
     """A sequence with errors on its known frames."""
     frames = np.flatnonzero(known)
-    place = (name, name, simulation, frames, stretches(simulation, frames))
-    more |= {"block": stretches(simulation, frames, 2.0)}
+    place = (name, name, simulation, frames, segments(simulation, frames))
+    more |= {"block": segments(simulation, frames, 2.0)}
     return LabelledSequence(*place, errors, {"ndt": 90}, **more)
 
 

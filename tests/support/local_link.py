@@ -7,7 +7,7 @@ import rec
 from drives import cloud
 
 from adaptune.ros.link import BusyError, LinkError
-from online.live import IMU, RosMessages, placed
+from online.topics import IMU_TYPE, RosMessages, placed
 
 STORE = rec.ROS1
 TYPES = STORE.types
@@ -75,7 +75,7 @@ class LocalLink:
         return dict(self.holds)
 
     def topics(self):
-        return {"/points": self.clouds, "/imu": IMU}
+        return {"/points": self.clouds, "/imu": IMU_TYPE}
 
     def why_unheard(self, topic):
         return self.deaf if topic == "/points" else ""

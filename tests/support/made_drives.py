@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from offline.drive import drive_sets
-from offline.frames import describe
+from offline.drive import drive_sets, trial_of
+from offline.frames import describe, segments_along
 from offline.shared_scans import SharedScans
-from offline.stretches import stretches_along
-from offline.trial import trial_of
 from offline.workers import Task
 
 
@@ -16,22 +14,22 @@ def described(setup, name="one"):
 
 
 def trials_of(setup, sets, name="one", frames=None, scans=None, most=np.inf, memory=1e9):
-    """Drive sets along the stretches of a sequence, and make trials of that."""
+    """Drive sets along the segments of a sequence, and make trials of that."""
     frames = described(setup, name) if frames is None else frames
     scans = setup.sequences.open(name) if scans is None else scans
     shared, found = SharedScans(memory), [{} for _ in sets]
-    for stretch in stretches_along(name, frames):
-        drives = drive_sets(setup, shared, scans, stretch, sets, most)
+    for segment in segments_along(name, frames):
+        drives = drive_sets(setup, shared, scans, segment, sets, most)
         for of_set, drive in zip(found, drives, strict=True):
-            of_set[stretch.first] = drive
+            of_set[segment.first] = drive
     pairs = zip(sets, found, strict=True)
     return [trial_of(setup.config, one, frames, of_set) for one, of_set in pairs]
 
 
 def task_of(setup, name, sets):
     """A task that drives sets along a whole sequence."""
-    (stretch,) = stretches_along(name, described(setup, name).uncut)
-    return Task(name, stretch=stretch, sets=sets)
+    (segment,) = segments_along(name, described(setup, name).uncut)
+    return Task(name, segment=segment, sets=sets)
 
 
 class Tasks:

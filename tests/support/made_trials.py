@@ -9,9 +9,10 @@ import numpy as np
 from random_models import SPACE
 from rooms import along_x
 
-from adaptune.archive import Archive, Frames, Summary, Trial
+from adaptune.odometry.tracker import RegisteredScan
+from adaptune.runs.archive import Archive, Frames, Trial, TrialSummary
+from adaptune.runs.record import Run
 from offline.config import OfflineConfig
-from offline.drive import Drive
 from offline.trial_table import trial_table
 
 N_FRAMES = 40
@@ -19,8 +20,7 @@ N_FRAMES = 40
 
 def made_trial(parameters, error):
     nothing, poses = np.zeros(N_FRAMES, bool), np.tile(np.eye(4), (N_FRAMES, 1, 1))
-    errors, seconds = np.full(N_FRAMES, error), np.full(N_FRAMES, 1e-3)
-    return Trial(parameters, poses, errors, nothing, ~nothing, seconds)
+    return Trial.of(parameters, poses, np.full(N_FRAMES, error), nothing, 1.0)
 
 
 def made_sets(n, space):
@@ -33,7 +33,9 @@ def made_table(error, n=40, fixed=None):
     sets = made_sets(n, SPACE)
     finished = {
         name: {
-            i: Summary(p, error(name, p), 0, 0, 1.0, {"register_ms": 1.0 + i, "prepare_ms": 1.0})
+            i: TrialSummary(
+                p, error(name, p), 0, 0, 1.0, {"register_ms": 1.0 + i, "prepare_ms": 1.0}
+            )
             for i, p in enumerate(sets)
         }
         for name in ("one", "two")
@@ -67,7 +69,7 @@ class Drawn:
 
     def wait(self):
         task, self._task = self._task, None
-        if task.stretch is not None:
+        if task.segment is not None:
             return [(0, {n: [self._drive(task, one)] for n, one in task.sets.items()})]
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
@@ -80,10 +82,13 @@ class Drawn:
         return [(0, frames)]
 
     def _drive(self, task, parameters):
-        """A drive that is too long by the error."""
-        drive, factor = Drive.lost(task.stretch), 1.0 + 0.01 * self.error(task.sequence, parameters)
-        drive.T_odom_sensor = along_x(0.3 * factor * np.arange(len(drive.tried)))
-        drive.registered[:] = drive.tried[:] = True
-        drive.without_pose[:] = False
-        drive.seconds[1:] = 1e-3
-        return drive
+        """A run that is too long by the error."""
+        factor = 1.0 + 0.01 * self.error(task.sequence, parameters)
+        return run_along(task.segment.stamps, 0.3 * factor)
+
+
+def run_along(stamps, step, seconds=1e-3):
+    """A run along x, with so many metres and seconds a scan."""
+    poses = along_x(step * np.arange(len(stamps)))
+    each = zip(stamps.tolist(), poses, strict=True)
+    return Run(steps=[RegisteredScan(at, T, True, None, 0.0, seconds) for at, T in each])

@@ -4,7 +4,7 @@ import json
 
 from needs import ros2_image
 
-from adaptune.odometry.docker.ros2_system import Ros2Settings
+from adaptune.odometry.systems.ros2_system import Ros2Settings
 
 TEMPLATE = """\
 /**:

@@ -2,8 +2,8 @@
 
 import pytest
 
+from adaptune._system.strict import ConfigurationError
 from adaptune.odometry import InProcess
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.drive import TrialSetup
 

@@ -7,7 +7,7 @@ import rec
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.recording import SequenceConfig
 from adaptune.recording.rendering import render_inspection
 

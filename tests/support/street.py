@@ -34,7 +34,7 @@ LOCKSTEP = "rustle, lockstep"
 SERVES = """
 import sys
 sys.path[:] = {path}
-from adaptune import processes
+from adaptune._system import processes
 from adaptune.odometry.registry import converse
 processes.answer_all(sys.stdin.buffer, sys.stdout.buffer, converse("gicp"))
 """

@@ -1,4 +1,6 @@
-"""Parameter sets for tests."""
+"""Parameter sets, and rows of comparisons, for tests."""
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,3 +15,8 @@ def table(unit, trials=None):
     )
     sets = tuple({f"p{i}": x for i, x in enumerate(row)} for row in unit.tolist())
     return ParameterSets(space, tuple(range(len(unit)) if trials is None else trials), sets)
+
+
+def with_run(row, **measured):
+    """The row of a comparison, with other figures of its run."""
+    return replace(row, run=row.run.model_copy(update=measured))

@@ -13,7 +13,7 @@ class Cheapest(Rule):
         self.best = min(data.candidates or data.sets, key=costs.alone)
         return self
 
-    def select(self, feature, live=NOTHING):  # noqa: ARG002
+    def select(self, feature, evidence=NOTHING):  # noqa: ARG002
         return Selection(self.best, self.sets[self.best], predicted_error=1.0)
 
 
@@ -30,30 +30,30 @@ class NoSelf(Cheapest):
 
 
 class Empty(Cheapest):
-    def select(self, feature, live=NOTHING):
+    def select(self, feature, evidence=NOTHING):
         pass
 
 
 class Number(Cheapest):
-    def select(self, feature, live=NOTHING):  # noqa: ARG002
+    def select(self, feature, evidence=NOTHING):  # noqa: ARG002
         return 3
 
 
 class Unknown(Cheapest):
-    def select(self, feature, live=NOTHING):
-        return super().select(feature, live)._replace(trial=999)
+    def select(self, feature, evidence=NOTHING):
+        return super().select(feature, evidence)._replace(trial=999)
 
 
 class OtherValues(Cheapest):
-    def select(self, feature, live=NOTHING):
-        return super().select(feature, live)._replace(parameters={"voxel": 1.9})
+    def select(self, feature, evidence=NOTHING):
+        return super().select(feature, evidence)._replace(parameters={"voxel": 1.9})
 
 
 class Weights(Cheapest):
     gives_weights = True
 
-    def select(self, feature, live=NOTHING):
-        selection = super().select(feature, live)
+    def select(self, feature, evidence=NOTHING):
+        selection = super().select(feature, evidence)
         return selection._replace(weights={77: 1.0})
 
 

@@ -11,7 +11,7 @@ class Walker(Odometry):
     """Moves by `speed` along x with every scan, where no script says otherwise."""
 
     space = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
-    live = False
+    live, warm_up = False, 2.0  # seconds
 
     def __init__(self, parameters, script=None):
         super().__init__(parameters)

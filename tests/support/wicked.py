@@ -6,7 +6,7 @@ import signal
 import time
 from pathlib import Path
 
-from adaptune.processes import server
+from adaptune._system.processes import server
 
 IMPORTS = {
     "exit": ("import sys\nprint('no licence')\nsys.exit(0)", "ended with code 0: no licence"),

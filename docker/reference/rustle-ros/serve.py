@@ -6,8 +6,8 @@ import socket
 import sys
 import threading
 
+from adaptune._system.processes import answer_all
 from adaptune.odometry.registry import converse
-from adaptune.processes import answer_all
 
 
 def main() -> None:

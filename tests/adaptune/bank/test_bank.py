@@ -9,12 +9,15 @@ import turns
 from rooms import moved
 from walker import at, makes, x_of, x_on
 
-from adaptune.bank.bank import CATCH_UP, WARM_UP, Bank
+from adaptune.bank.bank import CATCH_UP, Bank
 from adaptune.bank.rest import FIRST, FORGIVEN
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import InProcess
+from adaptune.odometry.base import WARM_UP, InProcess
 from adaptune.odometry.faults import MOST_FAULTS
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.remote import Isolated, Limits
+from adaptune.odometry.tracker import Tracker
+from adaptune.recording import Scan
 from adaptune.space import Selection
 
 METHOD = Path(__file__).parents[3] / "docs/method.md"
@@ -31,7 +34,7 @@ def steps_of(bank, n):
 
 def test_the_mean_of_all_motions_is_taken_by_their_weights():
     make, made = makes()
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.05}, 5: {"speed": 1.09}}, 3.0, 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.05}, 5: {"speed": 1.09}}, 0.1)
     x = x_of(odometry, range(2))
     odometry.apply(Selection(5, {}))
     x += x_on(odometry, range(2, 5))
@@ -49,7 +52,7 @@ def test_a_lost_one_is_left_out_and_started_anew(lost):
     speeds, weights = np.array([1.0, 1.02, 1.06]), np.array([0.4, 0.3, 0.3])
     make, made = makes({speeds[lost]: {5: 4.0}})
     sets = {trial: {"speed": speed} for trial, speed in zip((7, 3, 5), speeds, strict=True)}
-    odometry = Bank(make, sets, 2.0, 0.1)
+    odometry = Bank(make, sets, 0.1)
     weigh(odometry, *weights)
     x = x_of(odometry, range(9))
     mean, weights[lost] = weights @ speeds, 0.0
@@ -64,7 +67,7 @@ def test_a_lost_one_is_left_out_and_started_anew(lost):
 def test_a_member_that_is_lost_again_and_again_rests_for_twice_as_long_each_time():
     make, made = makes({1.02: dict.fromkeys(range(100), 4.0)})
     sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}
-    odometry = Bank(make, sets, 2.0, 0.1)
+    odometry = Bank(make, sets, 0.1)
     # It is lost all the time.
     np.testing.assert_allclose(np.diff(x_of(odometry, range(100))), 1.0)
     # On the scans of two seconds, at once and then after 10, 20 and 40 s.
@@ -75,7 +78,7 @@ def test_a_member_that_is_lost_again_and_again_rests_for_twice_as_long_each_time
 
 def test_a_member_that_was_well_for_a_minute_restarts_at_once():
     make, made = makes({1.02: dict.fromkeys((5, 9, 85), 4.0)})
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, 2.0, 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, 0.1)
     x_of(odometry, range(90))
     assert [second for second, _ in made[1].starts] == [0, 3, 16, 83]
 
@@ -92,7 +95,7 @@ def test_the_method_says_what_restarts_cost():
 def test_two_lost_members_that_agree_do_not_outvote_the_one_that_fits_the_scans(place):
     make, _ = makes()
     speeds = np.roll([turns.STEP, 0.0, 0.0, 3 * turns.STEP], place)
-    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)}, 1.0)
+    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)})
     weigh(bank, *[0.25] * 4)
     scans = list(map(turns.turn, range(13)))
     bank.start(bank.prepare(scans[0]), np.eye(4))
@@ -107,7 +110,7 @@ def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
     sets = {trial: {"speed": speed} for trial, speed in enumerate((0.0, 0.001, turns.STEP))}
     x = {}
     for lost in (False, True):
-        bank = Bank(make, sets, 1.0)
+        bank = Bank(make, sets)
         bank.apply(
             Selection(0, {}, dict.fromkeys(range(3), 1 / 3), state="lost" if lost else "good")
         )
@@ -119,7 +122,7 @@ def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
 
 def test_members_restart_where_the_selection_says_so():
     make, made = makes()
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 2.0, 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 0.1)
     x_of(odometry, range(5))
     odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, restart=frozenset({3})))
     x_on(odometry, range(5, 8))
@@ -130,15 +133,49 @@ def test_members_restart_where_the_selection_says_so():
     assert made[1].seen[-6:] == [2, 3, 4, 5, 6, 7]
 
 
+def test_one_that_needs_no_past_restarts_on_the_newest_scan():
+    make, made = makes({1.02: {5: 4.0}})
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, 0.1)
+    odometry._members[1].warm_up = 0.0
+    x = x_of(odometry, range(7))
+    assert made[1].starts[1:] == [(5, x[5])]
+    assert made[1].seen == [0, 1, 2, 3, 4, 5, 5, 6]
+
+
+def test_a_bank_that_is_lost_as_a_whole_says_so_of_the_scan_at_which_it_restarts():
+    make, _ = makes({speed: {5: np.nan} for speed in (1.0, 1.02)})
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 0.1)
+    tracker = Tracker(bank, HealthCheck())
+    steps = [tracker.register(at(i)) for i in range(7)]
+    assert [step.unhealthy for step in steps[4:]] == [None, "no_pose", None]
+    told = [{*step.states.values()} for step in steps[4:]]
+    assert told == [{"works"}, {"lost"}, {"works"}]
+
+
+def test_stamps_of_today_are_no_floats():
+    """No float holds 1.3e18 nanoseconds: rounded, the newest scan is not among the last ones."""
+    make, _ = makes()
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 0.1)
+    for member in odometry._members:
+        member.warm_up = 0.0
+    stamps = [1_300_000_000_000_000_255 + i * 10**9 for i in range(3)]
+    first, *others = (Scan(stamp, np.zeros((0, 3), np.float32)) for stamp in stamps)
+    assert any(stamp < float(stamp) for stamp in stamps)
+    odometry.start(odometry.prepare(first), np.eye(4))
+    for scan in others:
+        assert odometry.register(odometry.prepare(scan)).registered
+
+
 def test_members_that_rest_see_no_scans_until_they_are_woken():
     make, made = makes()
     sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.04}}
-    odometry = Bank(make, sets, 2.0, 0.1)
+    odometry = Bank(make, sets, 0.1)
     alone = Selection(7, {}, {7: 1.0}, resting=frozenset({3, 5}))
     odometry.apply(alone)
     assert x_of(odometry, range(5)) == [0, 1, 2, 3, 4]
     assert [len(one.seen) for one in made] == [5, 0, 0]
     assert [t for t, T in odometry.motions.members.items() if np.isfinite(T).all()] == [7]
+    assert odometry.motions.states == {7: "works", 3: "rests", 5: "rests"}
     odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, resting=frozenset({5})))
     np.testing.assert_allclose(np.diff([4.0, *x_on(odometry, range(5, 8))]), 1.01)
     # As one that restarts, it begins two seconds ago at the bank's pose.
@@ -160,7 +197,7 @@ def test_members_that_rest_see_no_scans_until_they_are_woken():
 
 def test_a_bank_has_no_other_sets():
     make, _ = makes()
-    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}}, 1.0)
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}})
     with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4"):
         bank.apply(Selection(4, {}))
     with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4, 5"):
@@ -170,10 +207,11 @@ def test_a_bank_has_no_other_sets():
 def test_motions_of_the_members_by_trial_number():
     (make, _), made = makes({1.02: {5: 4.0}}), []
     keep = lambda parameters: made.append(make(parameters)) or made[-1]  # noqa: E731
-    bank = Bank(keep, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, 2.0, 0.1)
+    bank = Bank(keep, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, 0.1)
     x_of(bank, range(6))
-    whole, members, starts = bank.motions
+    whole, members, starts, states = bank.motions
     assert starts == 1
+    assert states == {7: "works", 3: "lost", 5: "works"}
     assert list(members) == [7, 3, 5]
     # The motion of the lost member before it was restarted.
     assert [T[0, 3] for T in members.values()] == pytest.approx([1.0, 4.0, 1.06])
@@ -197,7 +235,7 @@ def with_faulty(fault):
         return Isolated("faulty:Faulty", {"x": 0.1}, faulty.Settings(fault=fault), limits)
 
     sets = {3: {"odometry": "mine", "x": 0.1}, 7: {"speed": 0.1}}
-    return Bank(make, sets, 2.0)
+    return Bank(make, sets)
 
 
 def test_a_member_that_a_fault_has_ended_is_told_once_and_starts_again(caplog):
@@ -229,7 +267,7 @@ def test_a_member_that_has_rested_since_the_start_has_not_ended(caplog):
 
 
 def test_of_members_that_have_all_ended_the_last_fault_is_of_the_last(caplog):
-    bank = Bank(makes()[0], {n: {"speed": 0.1} for n in (7, 3, 5)}, 2.0)
+    bank = Bank(makes()[0], {n: {"speed": 0.1} for n in (7, 3, 5)})
     bank._members = members = [SimpleNamespace(faults=[], ended=False) for _ in range(3)]
     for i in (1, 2, 0):
         members[i].faults, members[i].ended = [f"member {i}"], True
@@ -270,7 +308,7 @@ def test_other_processes_work_while_members_of_this_one_do():
         one.isolated = parameters["speed"] > 1.0
         return one
 
-    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 2.0, 0.1)
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 0.1)
     x_of(bank, range(2))
     assert calls == [("submit", True), ("submit", False), ("collect", False), ("collect", True)]
     assert [T[0, 3] for T in bank.motions.members.values()] == [1.0, 1.02]

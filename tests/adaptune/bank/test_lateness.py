@@ -34,7 +34,7 @@ def scan(i):
 class Slow(OdometryInstance):
     """A member of another process that needs its time."""
 
-    isolated = True
+    isolated, warm_up = True, 1.0  # seconds
 
     def __init__(self, clock, seconds=0.0):
         self.clock, self.seconds, self.done, self.n = clock, seconds, 0.0, 0
@@ -90,7 +90,7 @@ def bank_of(clock, rate=1.0, **seconds):
     """A bank of trials 3 and 5, and its members; they need some seconds for each scan."""
     members = {n: Slow(clock, seconds.get(f"of_{n}", 0.0)) for n in (3, 5)}
     sets = {n: {"n": n} for n in members}
-    bank = Bank(lambda own: members[own["n"]], sets, 1.0, rate=rate, clock=clock)
+    bank = Bank(lambda own: members[own["n"]], sets, rate=rate, clock=clock)
     bank.apply(EVEN)
     return bank, members
 
@@ -134,6 +134,7 @@ def test_a_member_that_is_always_late_is_removed(clock, caplog):
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         x, _ = run(bank, clock, n, before)
     assert list(bank.late.removed) == [False, True]
+    assert bank.motions.states == {3: "works", 5: "late"}
     assert caplog.messages == ["trial 5 was late for 5 s; the bank goes on without it"]
     np.testing.assert_allclose(x, STEP * np.arange(n))
     # It does not start again either.
@@ -274,7 +275,7 @@ def test_a_process_that_is_stopped_is_late_and_comes_back():
     pool = OdometryPool({"gicp": gicp})
     sets = {3: {"keyframe_interval": 1.0}, 5: {"keyframe_interval": 2.0}}
     sets = {n: pool.space.complete({"odometry": "gicp"} | own) for n, own in sets.items()}
-    bank = Bank(pool, sets, 1.0, cores=2, rate=0.05)  # two seconds a scan
+    bank = Bank(pool, sets, cores=2, rate=0.05)  # two seconds a scan
     bank.apply(EVEN)
     try:
         for i, (stamp, points, _) in enumerate(drives.scans(0, 16, STEP)):

@@ -5,7 +5,7 @@ from wicked import tell
 
 from adaptune.bank.bank import Bank
 from adaptune.bank.members import KEPT, SERVICE, Member, spread
-from adaptune.odometry.base import InProcess
+from adaptune.odometry.base import WARM_UP, InProcess
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
@@ -33,11 +33,10 @@ def scans():
     return [Scan(stamp, points) for stamp, points, _ in drives.scans(0, 40, STEP)]
 
 
-def bank(n_cores, seconds=1.0):
+def bank(n_cores):
     return Bank(
         POOL,
         {3 * i: POOL.space.complete(one) for i, one in enumerate(SETS)},
-        seconds,
         cores=n_cores,
     )
 
@@ -90,6 +89,8 @@ def test_members_that_restart_see_the_same_scans(scans):
         return before
 
     one, other = bank(1), bank(2)
+    for member in (*one._members, *other._members):
+        member.warm_up = 1.0
     poses, motions = run(one, scans, restarting(one))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("adaptune.bank.members.KEPT", 4)
@@ -99,6 +100,15 @@ def test_members_that_restart_see_the_same_scans(scans):
     np.testing.assert_array_equal(same, poses)
     np.testing.assert_array_equal(others, motions)
     assert KEPT > 12 * 10
+
+
+def test_members_know_how_much_of_the_past_they_need_wherever_they_run():
+    kiss = OdometryFactory("kiss_icp", {}, odometry_class("kiss_icp").space, Limits())
+    pool = OdometryPool({**POOL.factories, "kiss_icp": kiss})
+    sets = [{"odometry": "kiss_icp"}, {"odometry": "gicp"}]
+    for cores in (1, 2):
+        made = spread(pool, [pool.space.complete(one) for one in sets], cores)
+        assert [member.warm_up for member in made] == [WARM_UP, 0.0]
 
 
 def test_a_process_that_is_killed_costs_its_members_weight(scans):

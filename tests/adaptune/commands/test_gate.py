@@ -14,7 +14,7 @@ import pytest
 from fake_odometry import Fake
 
 import adaptune
-from adaptune import manifest
+from adaptune._system import manifest
 from adaptune.odometry.tracker import Tracker
 from online.gate import judged
 

@@ -8,7 +8,7 @@ import drives
 import pytest
 from needs import reference_image
 
-from adaptune.odometry.docker.engine import engine
+from adaptune.odometry.systems.engine import engine
 
 pytestmark = pytest.mark.services
 

@@ -1,10 +1,10 @@
 import pytest
 from commands import refused, succeeded
 
-from adaptune import yaml12
-from adaptune.odometry.docker import rustle as docker_rustle
+from adaptune._system import yaml12
+from adaptune._system.strict import ConfigurationError
+from adaptune.odometry.systems import rustle as docker_rustle
 from adaptune.space import ParameterSpace
-from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 
 PARAMETERS = """

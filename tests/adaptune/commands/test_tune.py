@@ -10,6 +10,7 @@ import drives
 import pytest
 import rec
 
+from adaptune._system.yaml12 import Document
 from adaptune.commands.tune import say_odometries
 from adaptune.recording.bag import BagSource
 from adaptune.simulation import Course
@@ -17,7 +18,6 @@ from adaptune.simulation.record import record
 from adaptune.study import loading
 from adaptune.study.driven import COST
 from adaptune.tuning import EACH, TRIALS, asked, studies, tuned
-from adaptune.yaml12 import Document
 from offline.config import load_study
 
 FAKE = ("--odometry", "fake_odometry:Fake")
@@ -47,14 +47,14 @@ def bag(study_file, tmp_path):
 def decided(monkeypatch):
     """Only decide; nothing is run. The studies that were decided."""
 
-    written, studies = tuned.written, []
+    write_study, studies = tuned.write_study, []
 
     def stop(*given):
-        study, _ = written(*given)
+        study, _ = write_study(*given)
         studies.append(study)
         raise tuned.AdaptuneError(str(study.folder / f"{study.name}.yaml"))
 
-    monkeypatch.setattr(tuned, "written", stop)
+    monkeypatch.setattr(tuned, "write_study", stop)
     return studies
 
 
@@ -234,7 +234,7 @@ def test_a_folder_that_grows_changes_only_the_lists_of_its_study(study_file):
     assert [line for line in before if line not in after] == ["  'one' ]  # why"]
     study = study_in(path)
     assert (study.training, study.config.test) == (["one", "three"], ("two",))
-    assert study.config.offline.stretches == 24
+    assert study.config.offline.segments == 24
 
 
 def test_of_several_odometries_each_has_its_rows_on_the_test(monkeypatch):

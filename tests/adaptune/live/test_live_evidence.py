@@ -419,9 +419,9 @@ def test_where_nobody_has_a_pose_all_keep_their_weight():
     ("case", "share"),
     [
         ({}, 1.0),
-        ({"familiarity": np.nan}, 1.0),
-        ({"familiarity": 0.5 * evidence.FAMILIAR}, 0.5),
-        ({"familiarity": 0.0}, None),
+        ({"similarity": np.nan}, 1.0),
+        ({"similarity": 0.5 * evidence.SIMILAR}, 0.5),
+        ({"similarity": 0.0}, None),
         ({"predicted": 0.4 / evidence.CONTRADICTED}, None),
         ({"restarted": 90 * 10**9}, None),
         ({"restarted": 10 * 10**9}, 1.0),
@@ -429,7 +429,7 @@ def test_where_nobody_has_a_pose_all_keep_their_weight():
     ],
 )
 def test_a_prediction_counts_where_training_knows_the_place(case, share):
-    given = {"familiarity": 1.0, "predicted": 1.0, "restarted": 0, "members": ()} | case
+    given = {"similarity": 1.0, "predicted": 1.0, "restarted": 0, "members": ()} | case
     alone = OwnError(1.0, 0.5, 2.0)
     own = SimpleNamespace(estimate_with=lambda _, known: known)
     live = SimpleNamespace(
@@ -439,5 +439,5 @@ def test_a_prediction_counts_where_training_knows_the_place(case, share):
         _newest=SimpleNamespace(stamp=100 * 10**9),
         _restarted=given["restarted"],
     )
-    found = LiveEvidence._own_error_with(live, given["predicted"], given["familiarity"])
+    found = LiveEvidence._own_error_with(live, given["predicted"], given["similarity"])
     assert found == (alone if share is None else share)

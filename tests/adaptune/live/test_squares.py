@@ -12,10 +12,10 @@ from adaptune.live.hops import (
     SECONDS,
     HopCloud,
     HopErrors,
-    LiveSquares,
+    HopSquares,
     blend,
     clip_to_best,
-    live_squares,
+    hop_squares,
     register,
 )
 from adaptune.model import weights
@@ -40,7 +40,7 @@ def empty(n_members):
 @given(ERRORS, st.floats(0.0, 2.0))
 def test_what_all_members_share_changes_no_weights(errors, constant):
     """Such as the registration's own error."""
-    products = live_squares(hops(errors)).products + 0.1 * np.eye(4)
+    products = hop_squares(hops(errors)).products + 0.1 * np.eye(4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(weights, "EVEN_SHARE", 0.0)
         plain, shifted = map(minimum_variance_weights, (products, products + constant))
@@ -57,9 +57,9 @@ def test_an_offset_of_a_hop_moves_all_errors_and_none_is_clipped_for_it(errors, 
 def test_products_are_means_over_hops():
     errors = np.zeros((2, 2, 3))
     errors[0, 0], errors[0, 1], errors[1, 1] = [1.0, 2.0, 0.0], [2.0, 0.0, 1.0], [0.0, 2.0, 0.0]
-    found = live_squares(hops(errors))
+    found = hop_squares(hops(errors))
     np.testing.assert_allclose(found.products, [[2.5, 1.0], [1.0, 4.5]])
-    assert live_squares(empty(2)) is None
+    assert hop_squares(empty(2)) is None
 
 
 def test_a_member_that_departs_from_the_others_counts_up_to_a_limit():
@@ -75,11 +75,11 @@ def test_a_member_that_departs_from_the_others_counts_up_to_a_limit():
 def test_a_member_without_a_pose_counts_as_lost():
     errors = np.ones((2, 3, 3))
     errors[1, 1] = np.nan
-    found = live_squares(hops(errors))
+    found = hop_squares(hops(errors))
     np.testing.assert_allclose(found.products.diagonal(), [3.0, 3.0 + CLIP**2 / 2, 3.0])
     np.testing.assert_allclose(found.products[0, 2], 3.0)
     # Nobody had one.
-    found = live_squares(hops(np.full((1, 2, 3), np.nan)))
+    found = hop_squares(hops(np.full((1, 2, 3), np.nan)))
     np.testing.assert_allclose(found.products, CLIP**2 * np.eye(2))
 
 
@@ -95,12 +95,12 @@ def test_a_member_without_a_pose_counts_as_lost():
     ],
 )
 def test_windows_are_counted_by_the_path_that_they_cover(start, windows):
-    assert live_squares(hops(np.ones((len(start), 2, 3)), start)).windows == pytest.approx(windows)
+    assert hop_squares(hops(np.ones((len(start), 2, 3)), start)).windows == pytest.approx(windows)
 
 
 @pytest.mark.parametrize("length", [10.0, 5.0])
 def test_the_registrations_own_part_grows_with_shorter_hops(length):
-    found = live_squares(hops(np.ones((3, 2, 3)), length=length))
+    found = hop_squares(hops(np.ones((3, 2, 3)), length=length))
     assert found.noise == pytest.approx((100.0 * NOISE / length) ** 2)
 
 
@@ -120,19 +120,19 @@ def test_a_hop_counts_while_it_is_young_or_near():
 def test_a_prior_and_measurements_weigh_by_their_windows():
     prior = np.array([[1.0, 0.5], [0.5, 4.0]])
     # Squares of 3 and 12 without noise: the same comparison as the prior, at a harder place.
-    live = LiveSquares(3.0 * prior + 1.0, 1.0, 2.0)
-    np.testing.assert_allclose(blend(prior, 2.0, live), prior + 1.0 / 6.0)
-    other = LiveSquares(prior[::-1, ::-1], 0.0, 6.0)
+    measured = HopSquares(3.0 * prior + 1.0, 1.0, 2.0)
+    np.testing.assert_allclose(blend(prior, 2.0, measured), prior + 1.0 / 6.0)
+    other = HopSquares(prior[::-1, ::-1], 0.0, 6.0)
     np.testing.assert_allclose(blend(prior, 2.0, other), 0.25 * prior + 0.75 * prior[::-1, ::-1])
     np.testing.assert_array_equal(blend(prior, 2.0, None), prior)
 
 
 def test_measurements_without_error_and_with_nothing_but_noise_are_finite():
     for products, noise in ((np.zeros((2, 2)), 0.0), (np.full((2, 2), 0.01), 5.0)):
-        found = blend(np.eye(2), 3.0, LiveSquares(products, noise, 4.0))
+        found = blend(np.eye(2), 3.0, HopSquares(products, noise, 4.0))
         assert np.isfinite(found).all()
         assert (found.diagonal() > 0.0).all()
-    assert np.isfinite(blend(np.zeros((2, 2)), 3.0, LiveSquares(np.eye(2), 0.0, 1.0))).all()
+    assert np.isfinite(blend(np.zeros((2, 2)), 3.0, HopSquares(np.eye(2), 0.0, 1.0))).all()
 
 
 def test_where_a_member_had_no_pose_it_may_count_as_the_worst():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from tables import table
 
-from adaptune.live.hops import LiveSquares
+from adaptune.live.hops import HopSquares
 from adaptune.metrics import FAILURE
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.weights import (
@@ -81,8 +81,8 @@ def test_the_fixed_set_keeps_its_minimum_share(of, kept, monkeypatch):
     assert sum(weights.values()) == pytest.approx(1.0)
     assert weights[0] == pytest.approx(kept, abs=0.05)
     # What is measured takes its place: 9 windows next to the prior's 3.
-    live = LiveSquares(np.diag([100.0, 1.0, 1.0, 100.0]), 0.0, 9.0)
-    weights = rule.weigh(rule.near(data.features[0][None]), live).weights
+    hops = HopSquares(np.diag([100.0, 1.0, 1.0, 100.0]), 0.0, 9.0)
+    weights = rule.weigh(rule.near(data.features[0][None]), hops).weights
     assert weights[0] == pytest.approx(kept / 4.0, abs=0.05)
 
 
@@ -91,20 +91,20 @@ def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more(monkeypat
     data = places(np.random.default_rng(3))
     rule = BankRule().fit(data)
     # The training says 1 and 2; driving says 0.
-    live = LiveSquares(np.diag([1.0, 4.0, 4.0, 4.0]), 0.0, 3.0)
+    hops = HopSquares(np.diag([1.0, 4.0, 4.0, 4.0]), 0.0, 3.0)
     known, new = data.features[5], np.array([500.0, 0.0])
     (near,) = rule.near(new[None]).frames.trust
     assert near == 0.0
-    assert rule.select(new).familiarity == 0.0
+    assert rule.select(new).similarity == 0.0
     assert (
-        rule.weigh(rule.near(new[None]), live).weights[0]
-        > rule.weigh(rule.near(known[None]), live).weights[0] + 0.1
+        rule.weigh(rule.near(new[None]), hops).weights[0]
+        > rule.weigh(rule.near(known[None]), hops).weights[0] + 0.1
     )
     # Without measurements, the fixed set is the best guess.
     assert rule.select(known).weights[0] < 0.1
     assert max(rule.select(new).weights.items(), key=lambda item: item[1])[0] == 0
     # As many windows as the prior has there: half and half.
-    few = live._replace(windows=UNFAMILIAR_PRIOR_SHARE * rule.settings.prior_windows)
+    few = hops._replace(windows=UNFAMILIAR_PRIOR_SHARE * rule.settings.prior_windows)
     (found,), _ = bank_weights(rule.near(new[None]), rule.settings, [few])
     assert found[0] == pytest.approx(rule.weigh(rule.near(new[None]), few).weights[0])
 
@@ -113,24 +113,24 @@ def test_many_windows_overrule_the_training(monkeypatch):
     monkeypatch.setattr("adaptune.model.weights.EVEN_SHARE", 0.0)
     data = places(np.random.default_rng(6))
     rule = BankRule().fit(data)
-    live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1e4)
-    assert rule.weigh(rule.near(data.features[0][None]), live).weights[3] > 0.9
+    hops = HopSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1e4)
+    assert rule.weigh(rule.near(data.features[0][None]), hops).weights[3] > 0.9
     assert (
-        rule.weigh(rule.near(data.features[0][None]), live._replace(windows=1e-3)).weights[3] < 0.1
+        rule.weigh(rule.near(data.features[0][None]), hops._replace(windows=1e-3)).weights[3] < 0.1
     )
     # The registrations' own part, which all share, changes nothing.
-    shifted = live._replace(products=live.products + 0.2, noise=0.2)
+    shifted = hops._replace(products=hops.products + 0.2, noise=0.2)
     found, plain = (
-        rule.weigh(rule.near(data.features[0][None]), one).weights for one in (shifted, live)
+        rule.weigh(rule.near(data.features[0][None]), one).weights for one in (shifted, hops)
     )
     np.testing.assert_allclose(list(found.values()), list(plain.values()), atol=1e-5)
 
 
 def test_without_training_the_first_member_has_the_weight_until_others_are_confirmed():
     assert measured_weights(3, None).tolist() == [1.0, 0.0, 0.0]
-    alike = measured_weights(3, LiveSquares(np.eye(3), 0.0, 3.0))
+    alike = measured_weights(3, HopSquares(np.eye(3), 0.0, 3.0))
     assert alike[0] > alike[1] == pytest.approx(alike[2])
-    many = measured_weights(3, LiveSquares(np.diag([100.0, 1.0, 1.0]), 0.0, 30.0))
+    many = measured_weights(3, HopSquares(np.diag([100.0, 1.0, 1.0]), 0.0, 30.0))
     assert many[0] < 0.1
 
 

@@ -10,7 +10,7 @@ from tables import table
 
 from adaptune.model import BankSettings, Rule, TrainingData
 from adaptune.model.registry import RULES, rule_class
-from adaptune.model.rules import Costs, Live, SetCost
+from adaptune.model.rules import Costs, Evidence, SetCost
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.selector import Selector
@@ -62,7 +62,7 @@ def check(selection, data, gives_weights):
     assert selection.trial in (data.candidates or TRIALS)
     assert selection.trial in (data.allowed or TRIALS)
     assert selection.parameters == data.sets[selection.trial]
-    for figure in (selection.predicted_error, selection.predicted_fixed, selection.familiarity):
+    for figure in (selection.predicted_error, selection.predicted_fixed, selection.similarity):
         assert math.isnan(figure) or 0.0 <= figure < math.inf
     assert (selection.weights is not None) == gives_weights
     if gives_weights:
@@ -137,13 +137,14 @@ def test_it_heeds_only_what_may_be_chosen_while_driving(name, members):
     data = training(members)
     rule, asked = fitted(name, data), []
 
-    def at_work(those, familiarity, predicted):
-        asked.append((familiarity, predicted))
+    def at_work(those, similarity, predicted):
+        asked.append((similarity, predicted))
         return those[:1]
 
-    live = Live(lambda: dict.fromkeys(TRIALS, 20.0) | {FIXED: 25.0}, lambda _: None, at_work)
+    worse = dict.fromkeys(TRIALS, 20.0) | {FIXED: 25.0}
+    evidence = Evidence(lambda: worse, lambda _: None, at_work)
     for feature in scans(data):
-        selection = rule.select(feature, live)
+        selection = rule.select(feature, evidence)
         check(selection, data, rule.gives_weights and members is not None)
         if asked:  # who rests has no weight
             assert selection.weights[members[0]] == pytest.approx(1.0)

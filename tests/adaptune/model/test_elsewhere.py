@@ -4,7 +4,7 @@ import turns
 from made_drives import Tasks
 from setups import setup_of
 
-from adaptune import processes as hosting
+from adaptune._system import processes as hosting
 from adaptune.errors import AdaptuneError
 from adaptune.model import descriptor
 from adaptune.model.descriptor import Describer, DescriptorError

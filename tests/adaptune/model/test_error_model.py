@@ -47,8 +47,8 @@ def several_odometries():
             "blocks": {"mine:shape": 88, "two": 2},
             "window": 3,
             "descriptors": np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
-            "stretch": np.arange(50) // 7,
-            "expected": {"loss": -0.2, "n_stretches": 4.0},
+            "segment": np.arange(50) // 7,
+            "expected": {"loss": -0.2, "n_segments": 4.0},
         },
         {"sets": several_odometries()},
     ],
@@ -69,10 +69,10 @@ def test_the_digest_is_of_what_selections_depend_on(tmp_path):
     assert dataclasses.replace(model, provenance={}).digest == model.digest
     errors = model.errors.copy()
     errors[3, 4] += 1
-    stretch = np.arange(50) // 7
+    segment = np.arange(50) // 7
     for other in (
         *({"fixed": 0}, {"window": 2}, {"errors": errors}),
-        *({"blocks": {"mine": 90}}, {"stretch": stretch}),
+        *({"blocks": {"mine": 90}}, {"segment": segment}),
     ):
         assert dataclasses.replace(model, **other).digest != model.digest
 
@@ -223,13 +223,13 @@ def test_costs_a_budget_and_what_is_recommended_survive(tmp_path):
     assert loaded.training_data(loaded.pca()).allowed == (0, 2, 4, 6)
 
 
-def test_evidence_is_of_stretches():
+def test_evidence_is_of_segments():
     model = random_model()
     assert model.training_data(model.pca()).sequence.max() == 1
-    stretch = np.arange(50) // 25
-    cut = dataclasses.replace(model, stretch=stretch)
+    segment = np.arange(50) // 25
+    cut = dataclasses.replace(model, segment=segment)
     number = cut.training_data(cut.pca()).sequence
-    np.testing.assert_array_equal(number, 2 * model.sequence + stretch)
+    np.testing.assert_array_equal(number, 2 * model.sequence + segment)
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o027, 0o640), (0o002, 0o664)])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tables import table
 
 from adaptune.model import FixedSet, TrainingData, rules
-from adaptune.model.rules import Live, complementary
+from adaptune.model.rules import Evidence, complementary
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -49,7 +49,7 @@ def plain_evidence(data, feature, m, sequences):
     return distances, means, fixed
 
 
-def plain_familiarity(data, distance, m):
+def plain_similarity(data, distance, m):
     """Share of training that is farther from other sequences than `distance`, in loops."""
     names = sorted(set(data.sequence.tolist()))
     if len(names) < 2:
@@ -73,7 +73,7 @@ def plain_predicted(data, feature, m, sharpness):
     weights = [math.exp(-sharpness * (a - min(distances)) / middle) for a in distances]
     expected = sum(w * f for w, f in zip(weights, fixed, strict=True)) / sum(weights)
     baseline = sum(w * of[0] for w, of in zip(weights, means, strict=True)) / sum(weights)
-    familiar = min(1.0, plain_familiarity(data, min(distances), m) / 0.1)
+    familiar = min(1.0, plain_similarity(data, min(distances), m) / 0.1)
     return expected, expected + familiar * (baseline - expected)
 
 
@@ -100,19 +100,19 @@ def test_it_follows_its_definition(seed, n_frames, n_sets, n_sequences, constant
             assert selection.predicted_error == selection.predicted_fixed
             assert selection.predicted_fixed == pytest.approx(fixed, rel=1e-5)
             distances, *_ = plain_evidence(data, feature, constants[0], names)
-            familiarity = plain_familiarity(data, min(distances), constants[0])
+            similarity = plain_similarity(data, min(distances), constants[0])
             # Among one sequence alone it is unknown.
-            of_several = familiarity if len(names) > 1 else np.nan
-            assert selection.familiarity == pytest.approx(of_several, nan_ok=True)
+            of_several = similarity if len(names) > 1 else np.nan
+            assert selection.similarity == pytest.approx(of_several, nan_ok=True)
             # Nothing is worse than what was measured.
-            selection = rule.select(feature, Live(lambda: {data.fixed: 31.0}))
+            selection = rule.select(feature, Evidence(lambda: {data.fixed: 31.0}))
             assert selection.trial == 0
             assert selection.predicted_error == pytest.approx(baseline, rel=1e-5)
 
 
 def test_the_baseline_counts_where_it_was_run_everywhere_and_is_allowed():
     data = replace(random_data(0, 20, 3), fixed=2)
-    worse = Live(lambda: {2: 31.0})
+    worse = Evidence(lambda: {2: 31.0})
     assert FixedSet().fit(data).select(np.zeros(3), worse).trial == 0
     assert FixedSet().fit(replace(data, allowed=(1, 2))).select(np.zeros(3), worse).trial == 2
     errors = data.errors.copy()

@@ -12,22 +12,22 @@ from made_drives import described, trials_of
 from odometry_node import path
 from setups import setup_of
 
-from adaptune.archive import Archive
+from adaptune._system.strict import ConfigurationError
 from adaptune.errors import OdometryError
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.program import CommandSettings, ProgramInput, WholeRun
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template
 from adaptune.recording import Scan
-from adaptune.strict import ConfigurationError
+from adaptune.runs.archive import Archive
+from adaptune.runs.record import Run
 from adaptune.trajectory import Trajectory
-from adaptune.trial_rows import rows
 from offline.campaign import BaselineError
 from offline.config import load_study
 from offline.train import train
+from offline.trial_table import rows
 from online.compare import compare
 from online.modes import run_replays
-from online.replay import ReplayRecord
 
 STUDY = """\
 odometry:
@@ -174,19 +174,18 @@ def test_scans_before_the_first_pose_are_unknown_and_do_not_count(make):
     trial, _ = run(study)
     assert not trial.faults
     assert not trial.restarted.any()
-    assert trial.registered.tolist() == [False] * 3 + [True] * 37
     assert np.isnan(trial.errors[:3]).all()
     np.testing.assert_allclose(trial.errors[3:], polite.errors[3:], atol=1e-4)
     assert trial.metrics["ape"] < 1e-4
     assert trial.metrics["rpe"] < 1e-4
-    assert trial.usage["first_pose"] == pytest.approx(0.3)
-    assert trial.unhealthy == {}
+    assert trial.others["first_pose"] == pytest.approx(0.3)
+    assert not trial.failure
     train(study)
     table = rows(Archive(study.folder / "trials"), ["one"])
     assert [row["first_pose"] for row in table] == pytest.approx([0.3] * 3)
     run_replays(study, study.model_path)
     for row in compare(study).rows:
-        assert row.restarts == 0
+        assert row.run.restarts == 0
         assert row.rte < 1e-3
         assert row.standard.ape < 1e-4
 
@@ -197,22 +196,22 @@ def test_what_it_takes_is_measured(make):
     study = make("work", f"offline.objective={objective}", once)
     trial, _ = run(study)
     # It computes for half a second with 200 MB, over 40 scans of 3.9 s.
-    assert 12.5 <= 1e3 * np.nanmedian(trial.seconds) < 200.0
-    assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
-    assert 200.0 <= trial.usage["memory"] < 1000.0
+    assert 12.5 <= trial.ms < 200.0
+    assert 100 * 0.5 / 3.9 <= trial.others["cpu"] < 200.0
+    assert 200.0 <= trial.others["memory"] < 1000.0
     assert len(train(study).trials) > 0
     # A replay counts the program's CPU time, too.
     run_replays(study, study.model_path)
-    assert all(row.cpu_ms > 12.5 for row in compare(study).rows)
+    assert all(row.run.cpu_ms > 12.5 for row in compare(study).rows)
     late = make("hang", "isolation.seconds=0.02")
     trial, _ = run(late)
     assert trial.faults
-    assert 1e3 * np.nanmedian(trial.seconds) >= 20.0
-    assert trial.usage["memory"] > 5.0
+    assert trial.ms >= 20.0
+    assert trial.others["memory"] > 5.0
 
 
 def test_another_frame(make):
-    (fault,) = run(make("camera"))[0].faults
+    (fault,) = run(make("camera"))[0].reasons
     assert re.search(r"another frame: turned by 120 degrees.*extrinsic.*: read", fault)
     lidar = "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]"
     trial, frames = run(make("camera", f"odometry.settings.extrinsic={lidar}"))
@@ -238,7 +237,7 @@ FAULTS = {
 def test_faults_are_told_with_the_last_lines(make, fault):
     study = make(fault, *["isolation.seconds=0.1"][: fault == "hang"])
     trial, _ = run(study)
-    (told,) = trial.faults
+    (told,) = trial.reasons
     assert re.search(FAULTS[fault], told, re.DOTALL), told
     assert re.fullmatch(r"no pose for \d+ of 40 scans", trial.failure)
     assert fault.startswith("begins") or trial.mean_error > 1.0
@@ -279,7 +278,7 @@ def test_one_file_that_fits_is_the_trajectory(make, output, told):
         np.testing.assert_allclose(trial.T_odom_sensor, frames.T_ref_sensor, atol=1e-6)
     else:
         told = told.format("results/now/config.yml, results/now/one_poses.tum")
-        (fault,) = trial.faults
+        (fault,) = trial.reasons
         assert fault.startswith(f"{told}; let odometry.settings.output fit just one file")
 
 
@@ -305,7 +304,7 @@ def test_poses_without_stamps_that_are_too_many_or_not_rigid(make):
         ("half", [], "20 of 40 scans"),
         ("pretend", ["sequences.one.stop=2.0"], "40 poses without stamps for 20 scans"),
     ):
-        assert told in run(make(fault, *kitti, *more))[0].faults[0]
+        assert told in run(make(fault, *kitti, *more))[0].reasons[0]
 
 
 def test_after_a_jump_the_health_check_goes_on_with_the_program_s_poses(make, monkeypatch):
@@ -339,13 +338,13 @@ def test_no_mode_pays_for_writing_a_part(make, monkeypatch):
     train(study)
     shutil.rmtree(study.folder / "inputs")
     monkeypatch.setattr("adaptune.study.sequences._inputs", {})
-    begin, written = ReplayRecord.begin, []
+    begin, written = Run.begin, []
 
     def note(record):
         written.append(any((study.folder / "inputs").rglob("stamps.npy")))
         begin(record)
 
-    monkeypatch.setattr(ReplayRecord, "begin", note)
+    monkeypatch.setattr(Run, "begin", note)
     run_replays(study, study.model_path)
     assert written[0]
 

@@ -28,7 +28,7 @@ from street import (
     usual_drive,
 )
 
-from adaptune import machine
+from adaptune._system import machine
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.prepared import prepared_bytes

@@ -156,3 +156,12 @@ def test_other_parameters_of_an_adapter_that_is_not_live():
     odometry = InProcess(Walker({}))
     with pytest.raises(OdometryError, match=r"scans: set online\.switching\.mechanism to bank"):
         odometry.apply(Selection(0, {"speed": 2.0}))
+
+
+@pytest.mark.parametrize("seconds", [-1.0, np.inf, np.nan])
+def test_the_past_that_a_restart_needs_is_a_number_of_seconds(seconds):
+    class Endless(Walker):
+        warm_up = seconds
+
+    with pytest.raises(OdometryError, match=r"Endless: warm_up is .*; give seconds, 0 or more"):
+        Endless.describe(None)

@@ -5,8 +5,8 @@ import re
 import pytest
 import yaml
 
+from adaptune._system.files import write_text
 from adaptune.errors import OdometryError
-from adaptune.files import write_text
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.kiss_icp import Kiss
 from adaptune.odometry.registry import declare, is_user_class, odometry_class

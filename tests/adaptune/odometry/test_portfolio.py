@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.portfolio import (
     FOLDER,

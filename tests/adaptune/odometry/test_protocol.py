@@ -15,7 +15,6 @@ from adaptune.space import Selection
 
 BASELINE = KeyframeGicp.space.baseline
 OTHER = {"max_correspondence_distance": 1.0, "keyframe_interval": 1.0}
-WARM_UP = 0.5
 FACTORY = OdometryFactory("gicp", {}, KeyframeGicp.space, Limits(seconds=60.0))
 
 
@@ -32,9 +31,9 @@ KINDS = {
     "isolated": isolated,
     "process": lambda: make("process"),
     "command": lambda: make("command"),
-    "bank": lambda: Bank(gicp, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
-    "bank, isolated": lambda: Bank(isolated, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
-    "bank, two cores": lambda: Bank(FACTORY, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0, cores=2),
+    "bank": lambda: Bank(gicp, {4: BASELINE, 9: OTHER}, 3.0),
+    "bank, isolated": lambda: Bank(isolated, {4: BASELINE, 9: OTHER}, 3.0),
+    "bank, two cores": lambda: Bank(FACTORY, {4: BASELINE, 9: OTHER}, 3.0, cores=2),
 }
 ELSEWHERE = {"isolated", "process", "bank, isolated", "bank, two cores"}
 every_kind = pytest.mark.parametrize("kind", KINDS)

@@ -92,7 +92,9 @@ def test_an_odometry_that_a_package_announces(monkeypatch):
     point = metadata.EntryPoint(
         "theirs", "adaptune.odometry.keyframe:KeyframeGicp", "adaptune.odometries"
     )
-    monkeypatch.setattr("adaptune.strict.entry_points", lambda group: [point][: "odom" in group])
+    monkeypatch.setattr(
+        "adaptune._system.strict.entry_points", lambda group: [point][: "odom" in group]
+    )
     assert odometry_class("theirs") is KeyframeGicp
     with pytest.raises(OdometryError, match="did you mean 'theirs'"):
         odometry_class("thiers")
@@ -248,7 +250,7 @@ def test_what_code_imports_is_part_of_it(package, tmp_path, monkeypatch):
 
 
 def test_descriptors_of_the_user_are_their_modules(package):
-    assert descriptor_content(["ndt", "motion"]) == {}
+    assert descriptor_content(["ndt"]) == {}
     before = descriptor_content(["ndt", "theirs.odometry:describe"])
     (package / "odometry.py").write_text("# another\n")
     after = descriptor_content(["ndt", "theirs.odometry:describe"])

@@ -18,8 +18,8 @@ from rooms import moved
 from setups import setup_of
 from street import served
 
-from adaptune import processes
-from adaptune.archive import Archive
+from adaptune._system import processes
+from adaptune._system.strict import ConfigurationError
 from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import OdometryFactory
@@ -31,11 +31,11 @@ from adaptune.odometry.registry import make_here
 from adaptune.odometry.remote import SERVICE, Isolated, Limits, Process, ProcessSettings
 from adaptune.recording import Imu, Scan
 from adaptune.recording.scan import ImuNoise
+from adaptune.runs.archive import Archive
+from adaptune.runs.loop import replay
 from adaptune.space import Selection
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.workers import Workers, run
-from online.replay import replay
 
 TOLD = {
     "abort": "ended by SIGABRT: about to go wrong",
@@ -111,6 +111,7 @@ def test_only_who_says_so_runs_clean_classes_here():
     assert isinstance(factory(here=True, name="faulty:Faulty")(), Isolated)
     assert isinstance(pickle.loads(pickle.dumps(factory(here=True)))(), Guarded)
     assert factory().description.module == "faulty"
+    assert [factory(here=here)().warm_up for here in (False, True)] == [1.5, 1.5]
 
 
 def test_a_class_is_the_same_odometry_here_and_there():
@@ -161,12 +162,11 @@ def test_a_trial_keeps_its_faults_and_goes_on(study_file, tmp_path):
     setup = setup_of(load_study(study_file, overrides, tmp_path / "study"))
     (trial,) = trials_of(setup, [{"x": 0.5}])
     assert np.flatnonzero(trial.restarted).tolist() == [12]
-    assert "SIGABRT" in trial.faults[0]
-    assert trial.unhealthy == {"no_pose": 1}
+    assert "SIGABRT" in trial.reasons[0]
     assert not trial.failure
     archive = Archive(tmp_path)
     archive.write("one", 0, trial)
-    assert archive.read("one", 0).faults == trial.faults
+    assert archive.read("one", 0).reasons == trial.reasons
     # And the campaign goes on.
     tasks = [task_of(setup, "one", {n: {"x": 0.5}}) for n in range(2)]
     with Workers(setup, 1, 1e9) as workers:

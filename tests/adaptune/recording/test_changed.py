@@ -45,7 +45,7 @@ def test_an_imu_that_is_not_there_or_of_another_time():
 @pytest.mark.parametrize("cache", [False, True])
 @pytest.mark.parametrize("compensate", [None, "constant_velocity"])
 def test_reading_from_a_scan_on_gives_the_same_scans(tmp_path, monkeypatch, cache, compensate):
-    monkeypatch.setattr("adaptune.recording.recording._BEFORE", 0.25)
+    monkeypatch.setattr("adaptune.recording.recording._SECONDS_BEFORE", 0.25)
     bag = str(rec.drive(tmp_path / "a.bag"))
     sequence = open_sequence(SequenceConfig(bag=bag, cache=cache, compensate=compensate))
     scans = list(sequence)  # into the cache

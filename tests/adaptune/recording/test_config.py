@@ -4,13 +4,13 @@ import rec
 from pydantic import ValidationError
 from rooms import along_x, write_kitti
 
-from adaptune import yaml12
+from adaptune._system import yaml12
+from adaptune._system.strict import ConfigurationError
 from adaptune.geometry import to_pose
 from adaptune.odometry.program import program_input
 from adaptune.recording import SequenceConfig
 from adaptune.recording.config import part_name, read_part
 from adaptune.recording.recording import RecordedSequence, open_sequence
-from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 

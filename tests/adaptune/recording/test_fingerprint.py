@@ -75,7 +75,7 @@ def test_damaged_lines_do_not_count(tmp_path, cache_folder, monkeypatch):
     file = write(tmp_path / "a", b"one")
     before = fingerprints([file])
     forget(monkeypatch)
-    path = cache_folder / cache.FILE
+    path = cache_folder / cache.FINGERPRINTS
     path.write_bytes(b"\xff\n" + path.read_bytes()[:40])
     assert fingerprints([file]) == before
 

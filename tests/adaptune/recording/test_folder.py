@@ -7,7 +7,8 @@ from rooms import write_kitti
 from scipy.spatial.transform import Rotation
 from small_bag import texts
 
-from adaptune import geometry, open3d
+from adaptune import geometry
+from adaptune._system import open3d
 from adaptune.errors import import_extra
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.folder import read_scan, turn_up

@@ -8,7 +8,7 @@ import rec
 from rosbags.highlevel import AnyReader
 from small_bag import START, bad_cloud, cloud, drive, entry, inspection_text, pose, texts
 
-from adaptune import yaml12
+from adaptune._system import yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.recording import SequenceConfig
 from adaptune.recording import inspect as module

@@ -169,7 +169,7 @@ def test_a_place_has_one_colour_and_its_name_no_second_time_in_the_legend(tmp_pa
     errors = Panel(Axis("time [s]"), Axis("y"), (spans, Line([0, 100], [1, 2], "fixed")))
     chart = Chart("one", "A chart", (path, errors), shared_x=True)
     texts, svg = drawn(chart, tmp_path)
-    # Each word has a white shadow: on the path, and above the stretch.
+    # Each word has a white shadow: on the path, and above the segment.
     expected = {"cave": 4, "street": 4, "nook": 0, "fixed": 1}
     assert {name: texts.count(name) for name in expected} == expected
     found = looks(chart)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from needs import needs_program
 
-from adaptune import processes
-from adaptune.keeper import descendants
+from adaptune._system import processes
+from adaptune._system.keeper import descendants
 from adaptune.ros import relay
 from adaptune.ros.link import LinkError
 from adaptune.ros.relay import Ros1, local_ros1, ros_python

@@ -21,9 +21,9 @@ from adaptune.space import Selection
 from adaptune.study.config import SteerConfig
 from adaptune.trajectory import read_tum
 from offline.config import load_study
-from online.live import RosMessages
 from online.robot import RobotDrive
 from online.steered import SteeredNode
+from online.topics import RosMessages
 
 pytestmark = pytest.mark.services
 
@@ -445,11 +445,11 @@ def test_it_drives(link, study_file, trained_folder, tmp_path):
     playing = threading.Thread(target=play, daemon=True)
     playing.start()
 
-    found = drive.run(other)
+    drive.run(other)
     playing.join(10.0)
     assert len(poses) == len(scans)
     other.close()
-    trajectory = read_tum(found.folder / "trajectory.tum")
+    trajectory = read_tum(drive.folder / "trajectory.tum")
     moved = [one.pose.pose.position.x for one in poses]
     np.testing.assert_allclose(moved, trajectory.T_world_sensor[:, 0, 3], atol=1e-6)
     np.testing.assert_allclose(moved, 0.3 * np.arange(len(scans)), atol=0.1)

@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from adaptune import open3d
+from adaptune._system import open3d
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, SENSORS, Course

@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 import adaptune
+from adaptune._system.progress import bars_and_words
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.progress import bars_and_words
 from adaptune.tuning.asked import Asked, named_odometry
 from adaptune.tuning.tuned import OutOfTimeError, within
 

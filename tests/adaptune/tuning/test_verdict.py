@@ -39,8 +39,7 @@ def test_the_file_says_what_the_front_and_the_sentences_say(study, found):
     assert data["on_another_drive"] == [row["low"], row["high"]]
     assert data["ratio"] > 0.0
     assert data["odometry"] == next(iter(study.config.odometries))
-    assert data["sets_tried"] == data["sets_asked"] == study.config.offline.trials
-    assert (data["budget"], data["budget_ms"] > 0.0) == ("2x", True)
+    assert data["budget"] == "2x"
 
 
 def test_the_file_agrees_with_the_front_of_training(study, found):

@@ -1,0 +1,1 @@
+"""What runs underneath: processes, files, settings, progress bars, the machine."""

@@ -1,1 +1,0 @@
-"""Odometries in Docker images."""
