@@ -46,7 +46,7 @@ adaptune.metrics: sub_trajectory_rte kitti_error absolute_error relative_error
 adaptune.space: Float Integer Categorical ParameterSpace ParameterSets Selection
 adaptune.odometry: Odometry Registration InProcess
 adaptune.odometry.tracker: Tracker HealthCheck
-adaptune.archive: Archive Trial
+adaptune.runs.archive: Archive Trial
 adaptune.model: ErrorModel
 adaptune.selector: Selector TimedSelector
 adaptune.errors: AdaptuneError
@@ -55,7 +55,8 @@ offline.train: train Training
 offline.scenario: scenario Scenario read_scenario write_scenario
 offline.annealing: AnnealingSampler
 online.modes: ReplaySetup
-online.replay: replay ReplayRecord
+adaptune.runs.loop: replay
+adaptune.runs.record: Run
 """
 """What the Python reference describes, by module."""
 
