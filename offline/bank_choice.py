@@ -41,6 +41,7 @@ class Figures(NamedTuple):
     worst: float
     n_segments: int
     n_recordings: int
+    error: float  # standard error of the logarithm of the geometric mean
 
 
 def log_ratios(
@@ -72,10 +73,10 @@ def expected_loss(logs: Logs, recordings: Sequence[str]) -> float:
 
 def figures(logs: Logs, recordings: Sequence[str]) -> Figures:
     """All that is said of a way to adapt."""
-    geometric, ends, _ = of_segments(logs, recordings)
+    geometric, ends, error = of_segments(logs, recordings)
     tenth, worst = (float(np.exp(ratio)) for ratio in (worst_tenth(logs), logs.max()))
-    loss, n_recordings = expected_loss(logs, recordings), len(set(recordings))
-    return Figures(loss, geometric, *(ends or (0.0, np.inf)), tenth, worst, len(logs), n_recordings)
+    loss, n = expected_loss(logs, recordings), len(set(recordings))
+    return Figures(loss, geometric, *(ends or (0.0, np.inf)), tenth, worst, len(logs), n, error)
 
 
 BANK_SETTINGS = [

@@ -307,18 +307,19 @@ class Elsewhere(NamedTuple):
     high: float
 
 
-def elsewhere(blocks: BlockErrors, trial: int) -> Elsewhere:
-    """What to expect of a set on another drive with this robot.
+def elsewhere(blocks: BlockErrors, trial: int, bank: tuple[float, float] = (1.0, 0.0)) -> Elsewhere:
+    """What to expect of a set on another drive with this robot, or of a bank.
 
-    How much drives differ is learned from the recordings, as far as there are several.
+    How much drives differ is learned from the recordings, as far as there are several. A bank is
+    its ratio to the set's error, and the standard error of the ratio's logarithm.
     """
     from scipy import stats  # slow to import
 
-    logs = blocks.logs()[:, [list(blocks.trials).index(trial)]]
-    if trial == blocks.trials[blocks.baseline]:
+    logs = blocks.logs()[:, [list(blocks.trials).index(trial)]] + np.log(bank[0])
+    if not logs.any():
         return Elsewhere(1.0, 1.0, 1.0)
     (mean,), (error,) = mean_and_error(logs, blocks.sequence)
-    error = error if np.isfinite(error) else ONE_BLOCK
+    error = np.hypot(*(e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1])))
     of = np.array([logs[blocks.sequence == s].mean() for s in np.unique(blocks.sequence)])
     freedom = KNOWN_DRIVES + len(of) - 1
     variance = (KNOWN_DRIVES * SPREAD**2 + ((of - mean) ** 2).sum()) / freedom

@@ -58,11 +58,9 @@ def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> lis
         rows.append(row | {"trial": trial, "_bound": of_bounds[trial]})
     members = [trial for trial in model.bank if trial not in model.reserve]
     if (of_bank := model.expected) and len(members) > 1:
-        fixed, by = elsewhere(blocks, model.fixed), of_bank["geometric"]
+        by = of_bank["geometric"]
         error = by * means[list(blocks.trials).index(model.fixed)]
-        wider = np.log(np.array([of_bank["low"], of_bank["high"]]) / by)
-        ends = np.hypot(np.log(np.array(fixed[1:]) / fixed.ratio), wider) * (-1.0, 1.0)
-        ratio = Elsewhere(by * fixed.ratio, *(by * fixed.ratio * np.exp(ends)).tolist())
+        ratio = elsewhere(blocks, model.fixed, (by, of_bank["error"]))
         row = _row([ADAPTIVE], error, costs.adaptive(members), ratio)
         row |= {"recommended": model.recommended == ADAPTIVE}
         row |= {"parameters": f"trials {', '.join(map(str, members))}", "odometry": ""}

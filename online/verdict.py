@@ -160,8 +160,7 @@ def verdict(
     if bank := last.get(ADAPTIVE):
         gains = bank is not best and _ratio(bank).value < 1.0
         first = "With cores to spare: adaptive, " if gains else "Adapting: "
-        same = FIXED in last and _is_baseline(last[FIXED])
-        said.append(f"{first}{_to_yardstick(bank, last, 'their' if same else '')}.")
+        said.append(f"{first}{_to_yardstick(bank, last)}.")
     elif obstacle:
         said.append(f"Nothing adapts: {obstacle}.")
     said += [own["left out"]] if own and own["left out"] else []
@@ -208,10 +207,11 @@ def _why_kept(
     ]
 
 
-def _to_yardstick(row: ComparisonRow, last: Mapping[str, ComparisonRow], whose: str = "") -> str:
+def _to_yardstick(row: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
     """Error and CPU time of a mode, in times those of the fixed set, or the baseline."""
-    whose, other = whose or f"the {YARDSTICKS[row.yardstick]}'s", last[row.yardstick].run.cpu_ms
-    ratio = _ratio(row)
+    same = FIXED in last and _is_baseline(last[FIXED])  # as the sentences before name them
+    whose = "their" if same else f"the {YARDSTICKS[row.yardstick]}'s"
+    ratio, other = _ratio(row), last[row.yardstick].run.cpu_ms
     said = f"{ratio.value:.2f} times {whose} error ({_interval(ratio)})"
     if ratio.interval and ratio.interval[1] - ratio.interval[0] < ROUNDING:
         said = f"exactly {whose} error, as it drove the same set"

@@ -197,3 +197,15 @@ def test_another_drive_is_less_sure_than_this_one():
     errors[:, 1] *= np.repeat([0.2, 3.0] * 4, 5)
     apart = elsewhere(blocks(errors, sequence=places), 1)
     assert apart.high / apart.low > high / low
+
+
+def test_what_a_bank_does_on_another_drive_is_no_surer_than_what_its_set_does():
+    errors = noisy([1.0, 0.5], 40)
+    alone, even = elsewhere(blocks(errors), 1), elsewhere(blocks(errors), 1, (0.8, 0.0))
+    assert np.allclose(np.array(even) / alone, 0.8)
+    # One segment, or two that differ, say little; they leave no limits that say nothing.
+    for error in (0.6, np.inf):
+        unsure = elsewhere(blocks(errors), 1, (0.8, error))
+        assert alone.high / alone.low < unsure.high / unsure.low < 60.0
+    # Where the set is the baseline, drives differ, too.
+    assert elsewhere(blocks(errors), 0, (0.8, 0.1)).high > 1.0
