@@ -362,6 +362,10 @@ class Transport:
         """What has happened, and how the process ended, if that is known."""
         return what
 
+    def used(self) -> tuple[float, float] | None:
+        """CPU seconds and megabytes that are seen of it from here, for one that tells nothing."""
+        return None
+
     def close(self) -> None:
         """End the process, if it does not end with its stream."""
 

@@ -6,6 +6,7 @@ milliseconds, and global state of the odometry ends with its process.
 
 import os
 import socket
+import time
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
@@ -74,7 +75,8 @@ class Isolated(Faulting):
         transport: processes.Transport | None = None,
     ):
         super().__init__(name, parameters)
-        self._cpu = self._cpu_before = self._memory = 0.0  # as the other processes report
+        self._cpu = self._cpu_before = self._memory = 0.0  # of the other processes
+        self._waited = 0.0  # seconds for poses, since the process began
         plain = settings if isinstance(settings, dict) else settings.model_dump(mode="json")
         self._settings = plain
         self._odometry = name if transport is None else None  # a program is one odometry
@@ -116,7 +118,7 @@ class Isolated(Faulting):
 
     def begin(self) -> processes.Message | None:
         """Begin a process; its answer, None after a fault, which is an error the first time."""
-        self._cpu_before = self._cpu
+        self._cpu_before, self._waited = self._cpu, 0.0
         try:
             self._conversation.open()
         except UnavailableError:
@@ -135,19 +137,21 @@ class Isolated(Faulting):
 
     def submit(self, prepared: Any) -> None:
         self._submitted, self._busy = prepared.stamp, True
+        self._waited -= time.perf_counter()
         header, arrays = self._scan(prepared)
         self._conversation.send({**header, "type": "register"}, **arrays)
 
     def _collect(self) -> Registration:
         """The answer to the submitted scan; NaN if there is none, or a wrong one."""
         answer = self._receive()
+        self._waited += time.perf_counter()
         self._busy = False
         if answer is None:
             return WITHOUT_POSE
         try:
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
-            cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
+            cpu, memory = self._used(answer.header)
             wrong = pose_fault(T_odom_sensor) if self._checks_poses else None
             if late:
                 wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
@@ -161,6 +165,16 @@ class Isolated(Faulting):
         self._cpu = self._cpu_before + cpu
         self._memory = max(self._memory, memory)
         return Registration(T_odom_sensor.copy(), bool(registered))
+
+    def _used(self, header: dict[str, Any]) -> tuple[float, float]:
+        """CPU seconds and megabytes, as the process tells them, or else as they are seen."""
+        seen = {}
+        if "cpu" not in header:
+            # Of one that runs elsewhere, nothing is seen but how long it takes.
+            used = self._conversation.transport.used() or (self._waited, 0.0)
+            seen = dict(zip(("cpu", "memory"), used, strict=True))
+        cpu, memory = (float((seen | header).get(key, 0.0)) for key in ("cpu", "memory"))
+        return cpu, memory
 
     def apply(self, selection: Selection) -> None:
         self.parameters |= selection.parameters
@@ -241,6 +255,12 @@ class ProgramTransport(processes.Transport):
         if (ended := self._program.wait(0.5)) is not None:
             what = processes.how_it_ended(ended.code)
         return processes.quoting(what, self._program.last_lines())
+
+    def used(self) -> tuple[float, float] | None:
+        if self._program is None:
+            return None
+        ended = self._program.used()
+        return ended.cpu, ended.memory
 
     def close(self) -> None:
         if self._program is not None:

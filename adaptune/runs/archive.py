@@ -190,6 +190,8 @@ _TRIAL = re.compile(r"\d{5,}\.npz")
 
 CURRENT = "current.json"
 """By sequence, the name of the folder that was used last."""
+NAMED_BY_DIGEST = f"trials/*-{'[0-9a-f]' * manifest.SHORT}"
+"""The folders of sequences, below a study's."""
 
 
 class Archive:
@@ -267,7 +269,7 @@ class Archive:
         n = 0
         for name in self._sources.names:
             last = self.folder / self._last.get(name, name)
-            if (before := manifest.recorded(last / manifest.FILE)) is not None:
+            if (before := self._recorded(last, name)) is not None:
                 files = self._sources.files(name)
                 why |= dict.fromkeys(manifest.changes(before, self.inputs(name), files))
                 n += max(0, len(_trials(last)) - len(self.finished(name)))
@@ -276,6 +278,24 @@ class Archive:
         if why:
             again = f"{n} trials are run again" if n else "since the last run"
             _log.warning("%s: %s", again, "; ".join(why))
+
+    def _recorded(self, folder: Path, sequence: str) -> dict[str, Any] | None:
+        """What trials depend on; None where that is damaged, and its folder is named by what is."""
+        try:
+            return manifest.recorded(folder / manifest.FILE)
+        except ConfigurationError:
+            if folder != self.of(sequence):
+                raise
+            return None
+
+    def changes(self) -> list[str]:
+        """In what the study differs from that of the last trials, in words, recordings apart."""
+        assert self._sources is not None
+        for name in self._last.values():
+            if before := manifest.recorded(self.folder / name / manifest.FILE):
+                before = _of_poses(before)
+                return manifest.changes(before, before | _of_poses(self._sources.shared))
+        return []
 
     def trial_path(self, sequence: str, number: int, kind: Kind = "") -> Path:
         """File of a trial, or of another drive of its set, if that is another one."""

@@ -24,7 +24,7 @@ from adaptune.odometry.registry import (
 from adaptune.recording import cache
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence
-from adaptune.runs.archive import CURRENT
+from adaptune.runs.archive import CURRENT, NAMED_BY_DIGEST
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.study.config import (
     ROLES,
@@ -248,7 +248,8 @@ def read_study(
         said = dict.fromkeys(_say(m, given, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
     for older in ("trials/*/inputs.json", "replays/*/reference.inputs.json"):
-        if any(folder.glob(older)) and not (folder / "trials" / CURRENT).exists():
+        of_now = (folder / "trials" / CURRENT).exists() or any(folder.glob(NAMED_BY_DIGEST))
+        if any(folder.glob(older)) and not of_now:
             what = "its trials and replays are of an older adaptune, which kept them in another way"
             raise ConfigurationError(f"{folder}: {what}; run again with another --folder")
     return Study(config, folder)

@@ -45,6 +45,9 @@ def main(fault="none"):
             send(writer, answer | ({} if fault == "space" else {"space": SPACE}))
         elif kind == "register":
             n += 1
+            until = time.process_time() + (0.05 if fault == "works" else 0.0)
+            while time.process_time() < until:
+                pass
             pose[3] += parameters["speed"]
             stamp = header["stamp"]
             if n == 3:

@@ -4,6 +4,7 @@ import pickle
 import re
 import socket
 import struct
+import subprocess
 import sys
 import threading
 
@@ -306,6 +307,41 @@ def test_faults_are_told_and_another_start_goes_on(fault, caplog):
     assert f"{sys.executable} with {{}}: {told}" in caplog.messages
     odometry.start(scan(5), np.eye(4))
     assert odometry.register(scan(6)).T_odom_sensor[0, 3] == 1.0
+
+
+def test_what_a_program_takes_is_seen_where_it_does_not_tell_it():
+    odometry = Process({}, program("works"), LIMITS)
+    for starts in (1, 2):
+        odometry.start(scan(0), np.eye(4))
+        for i in (1, 2, 3, 4):
+            odometry.register(scan(i))
+        assert odometry.usage.cpu >= 0.2 * starts - 0.02  # a tick of the clock is 0.01 s
+        assert odometry.usage.memory > 1.0
+        odometry.close()
+
+
+def test_of_a_program_elsewhere_the_time_until_its_poses_counts(tmp_path):
+    where = tmp_path / "socket"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(where))
+        listener.listen()
+        odometry = Process({}, ProcessSettings(address=f"unix:{where}"), LIMITS)
+        started = []
+
+        def serve():
+            with listener.accept()[0] as there:
+                command = program("works").command
+                started.append(subprocess.Popen(command, stdin=there, stdout=there))
+
+        serving = threading.Thread(target=serve)
+        serving.start()
+        odometry.start(scan(0), np.eye(4))
+        serving.join()
+        for i in (1, 2, 3):
+            odometry.register(scan(i))
+        assert odometry.usage.cpu >= 0.15
+        odometry.close()
+    started[0].wait()
 
 
 def test_equal_faults_are_told_once(caplog):
