@@ -316,12 +316,12 @@ def elsewhere(blocks: BlockErrors, trial: int, bank: tuple[float, float] = (1.0,
     from scipy import stats  # slow to import
 
     logs = blocks.logs()[:, [list(blocks.trials).index(trial)]] + np.log(bank[0])
-    if not logs.any():
+    if trial == blocks.trials[blocks.baseline] and bank == (1.0, 0.0):
         return Elsewhere(1.0, 1.0, 1.0)
     (mean,), (error,) = mean_and_error(logs, blocks.sequence)
-    error = np.hypot(*(e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1])))
+    error, of_bank = (e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1]))
     of = np.array([logs[blocks.sequence == s].mean() for s in np.unique(blocks.sequence)])
     freedom = KNOWN_DRIVES + len(of) - 1
     variance = (KNOWN_DRIVES * SPREAD**2 + ((of - mean) ** 2).sum()) / freedom
-    margin = stats.t.ppf(0.975, freedom) * np.sqrt(variance + error**2)
+    margin = stats.t.ppf(0.975, freedom) * np.sqrt(variance + error**2 + of_bank**2)
     return Elsewhere(*(float(np.exp(mean + by)) for by in (0.0, -margin, margin)))

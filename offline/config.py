@@ -462,7 +462,6 @@ class OfflineStudyConfig(StudyConfig):
     def resolved(self) -> dict[str, Any]:
         """See `StudyConfig.resolved`."""
         resolved, offline = super().resolved(), self.offline
-        resolved["offline"]["segments"] = self.segments or "all"
         if settings := SETTINGS.get(offline.sampler):
             given = settings.model_validate(offline.sampler_settings)
             whole = given.model_dump(mode="json", exclude_none=True)
@@ -472,7 +471,7 @@ class OfflineStudyConfig(StudyConfig):
     @property
     def search_inputs(self) -> dict[str, Any]:
         """What makes the trials of a study those that they are: another search has others."""
-        offline = self.resolved()["offline"]
+        offline = self.resolved()["offline"] | {"segments": self.segments or "all"}
         return {key: value for key in _SEARCH if (value := offline.get(key))}
 
 

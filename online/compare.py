@@ -70,7 +70,7 @@ def compared_modes(replays: Replays) -> ComparedModes:
     finished = [name for name, there in made.items() if due.issubset(there)]
     # No mode is everywhere: those with the fixed set are compared.
     finished = finished or [name for name in names if "fixed" in made[name]]
-    if not finished and not names:
+    if not names and (not finished or replays.model is not None):
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
         for mode in WITHOUT_MODEL if replays.model is None else (FIXED,):
@@ -82,11 +82,14 @@ def compared_modes(replays: Replays) -> ComparedModes:
     words = (
         f"Not compared, because replays are missing: {where}; `adaptune online{option}` makes them."
     )
-    others = {
-        (why, n): m for m, on in missing.items() for n in on if (why := replays.changes(n, m))
-    }
-    for (why, name), mode in others.items():
-        _log.warning("%s: the last replay of `%s` was made from other inputs: %s", name, mode, why)
+    others: dict[tuple[str, str], list[str]] = {}
+    for mode, on in missing.items():
+        for name in on:
+            if why := replays.changes(name, mode):
+                others.setdefault((name, why), []).append(f"`{mode}`")
+    for (name, why), those in others.items():
+        which = f"last replay of {' and '.join(those)} was made from other inputs"
+        _log.warning("%s: the %s: %s", name, which, why)
     return ComparedModes(tuple(finished), compared, unfinished, [words] if where else [])
 
 
@@ -189,8 +192,12 @@ def compare(study: Study) -> Comparison:
     StoredReplayError
         If that of the fixed set is missing, or one is damaged, or of another recording or
         configuration.
+    ModeError
+        If the model was fitted for another budget, or another bank.
     """
     replays = Replays.of(study)
+    if replays.model is not None:
+        replays.setup.check(study.model_file or study.model_path)
     compared, model = compared_modes(replays), replays.model
     names, modes = compared.sequences, compared.modes
     judged: list[JudgedModes] = []
@@ -225,7 +232,9 @@ def compare(study: Study) -> Comparison:
         whose = {} if model is None else _odometries(model)
         said += verdict(rows, length, recommended, front, obstacle, tried, whose)
         said += late(rows, advised, periods)
-        said += [] if model is None else _of_estimates(study, model)
+        said += [] if model is None else _lost_in_training(model) + _of_estimates(study, model)
+        if recommended not in modes and not replays.setup.obstacle(recommended):
+            said += [] if model is None else compared.words
     details = [w for w in (*wrong, *remarks(rows), *compared.words) if w not in said]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -246,6 +255,20 @@ def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> l
     faults = [row.run.fault for row in of_best if row.rte and row.rte > LOST_ABOVE]
     said = lost_in_words(study, called(best.mode), errors, faults)
     return [*said, "Until then, rely on none."] if said else []
+
+
+def _lost_in_training(model: ErrorModel) -> list[str]:
+    """Where baseline and fixed set lost track in training, which decides more than how well."""
+    found = dict[int, list[str]]()
+    for number, name in enumerate(model.sequences):
+        rows = model.sequence == number
+        means = rules.mean_errors(model.errors[rows], model.sequence[rows])
+        for trial, mean in zip(model.sets, means, strict=True):
+            if trial in (rules.BASELINE, model.fixed) and LOST_ABOVE < mean < np.inf:
+                found.setdefault(trial, []).append(f"{name} (RTE {mean:.1f} %)")
+    who = {model.fixed: called(FIXED), rules.BASELINE: called(BASELINE)}
+    said = [f"{who[trial]} lost track on {', '.join(on)}" for trial, on in found.items()]
+    return [f"In training, {', and '.join(said)}."] if said else []
 
 
 def _of_estimates(study: Study, model: ErrorModel) -> list[str]:
@@ -270,7 +293,11 @@ def _front(study: Study, model: ErrorModel | None) -> list[dict[str, Any]]:
     path = study.folder / "front.json"
     if model is None or not path.exists():
         return []
-    rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
+    try:
+        rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
+    except ValueError as error:
+        what = f"{path}: is damaged ({error}); run `adaptune offline` again"
+        raise StoredReplayError(what) from error
     return rows
 
 

@@ -167,7 +167,7 @@ class ReplaySetup:
             alone = len(model.bank) < 2
             return "the model's bank has no other member than the fixed set" if alone else ""
         if model is not None and self._mechanism(name, model) is None:
-            return no_bank(self.mechanism, self.odometry)
+            return no_bank(self.mechanism, self.odometry, model)
         return ""
 
     @property

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+from adaptune.metrics import LOST_ABOVE
 from adaptune.model.registry import ADAPTIVE
 from adaptune.paired import Ratio
 from adaptune.study import driven as may
@@ -27,10 +28,10 @@ def _judged(rows: Sequence[ComparisonRow]) -> dict[str, ComparisonRow]:
 
 
 def decided(rows: Sequence[ComparisonRow], recommended: str = FIXED) -> ComparisonRow | None:
-    """What to drive: what training recommends, unless it is surely worse than the baseline here.
+    """What to drive: what training recommends, unless the baseline is surely better here.
 
-    Without training, the untrained bank where it is surely better. The rows over all sequences come
-    last. None if no test sequence has a reference.
+    Or holds track where that does not. Without training, the untrained bank where it is surely
+    better. The rows over all sequences come last. None if no test sequence has a reference.
     """
     last = _judged(rows)
     if not last:
@@ -42,7 +43,12 @@ def decided(rows: Sequence[ComparisonRow], recommended: str = FIXED) -> Comparis
         better = bank is not None and FIXED not in last and _to_baseline(bank).interval
         return bank if better and better[1] < 1.0 else one or base
     ends = _to_baseline(one).interval
-    return base if (ends is not None and ends[0] > 1.0) or _is_baseline(one) else one
+    worse = (ends is not None and ends[0] > 1.0) or _alone_loses_track(one, base)
+    return base if worse or _is_baseline(one) else one
+
+
+def _alone_loses_track(row: ComparisonRow, other: ComparisonRow) -> bool:
+    return (other.rte or 0.0) <= LOST_ABOVE < (row.rte or 0.0)
 
 
 def _to_baseline(row: ComparisonRow) -> Ratio:
@@ -188,7 +194,10 @@ def _gained(
     if own is not None and own["low"] is not None:
         worse = ", so perhaps more" * (own["low"] < 1.0 < own["high"])
         ends = f"{_end(own['low'])} to {_end(own['high'])}"
-        sure += f"; on another drive, expect {ends} times{worse}"
+        expected = f"on another drive, expect {ends} times{worse}"
+        if not own["low"] <= ratio.value <= own["high"]:
+            expected = f"by training, it was to be {ends} times"
+        sure += f"; {expected}"
     return [f"{said}.", f"{sure}."]
 
 
@@ -198,11 +207,15 @@ def _why_kept(
     """Why the odometry's own parameters are kept."""
     other = last.get(recommended)
     if other is None or other is best or _is_baseline(other):
-        none = f"none of {tried - 1} other sets" if tried > 2 else "no other set"
-        return [f"In training, {none} was safely better within the budget."] * (FIXED in last)
-    ratio = _to_baseline(other)
+        if tried < 2:
+            return ["No other set was tried: allow more trials, or more time."] * (FIXED in last)
+        was = f"none of {tried - 1} other sets was" if tried > 2 else "the other set was not"
+        return [f"In training, {was} safely better within the budget."] * (FIXED in last)
+    ratio, what = _to_baseline(other), "is surely worse here"
+    if _alone_loses_track(other, best):
+        what = f"loses track here, with {other.rte:.1f} %"
     return [
-        f"{called(recommended).capitalize()}, which training recommends, is surely worse here: "
+        f"{called(recommended).capitalize()}, which training recommends, {what}: "
         f"{ratio.value:.2f} times its error ({_interval(ratio)})."
     ]
 

@@ -108,7 +108,7 @@ def driven(
     fixed = f"trial {named(model, model.fixed)}" + ", the baseline" * (not model.fixed)
     expected = f": {expected_in_words(model.expected)}" if model.expected else ""
     if mechanism_of(ADAPTIVE, model, mechanism, odometry.description.live) != "bank":
-        return f"Recommended: {fixed}. Nothing adapts: {no_bank(mechanism, odometry)}."
+        return f"Recommended: {fixed}. Nothing adapts: {no_bank(mechanism, odometry, model)}."
     trials = [t for t in bank_members(online.switching, model) if t not in model.reserve]
     members = ", ".join(named(model, trial) for trial in trials)
     bank = f"the bank of trials {members}"
@@ -116,11 +116,15 @@ def driven(
         bank += f", at {cost:.1f} ms of CPU time a scan"
     if model.recommended == ADAPTIVE:
         return f"Recommended: adaptive, {bank}{expected}."
-    return f"Recommended: {fixed}. With cores to spare: adaptive, {bank}{expected}."
+    gains = not model.expected or model.expected["geometric"] < 1.0
+    adapting = "With cores to spare: adaptive" if gains else "Adapting"
+    return f"Recommended: {fixed}. {adapting}, {bank}{expected}."
 
 
-def no_bank(mechanism: Mechanism | None, odometry: Factory) -> str:
+def no_bank(mechanism: Mechanism | None, odometry: Factory, model: ErrorModel) -> str:
     """Why a model has no bank to drive."""
+    if mechanism == "bank" and len(model.sets) < 2:
+        return "no other set was tried"
     if mechanism == "bank":
         return "no second set may join the fixed one in a bank (online.budget, or the others fail)"
     if mechanism == "live":

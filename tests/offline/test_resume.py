@@ -99,6 +99,22 @@ def test_with_nothing_to_do_nothing_is_done(trained):
     assert len(first.trials) == 4
 
 
+def test_a_folder_names_the_study_that_was_trained_in_it(trained):
+    for name in trained.training:
+        assert load_study(trained.folder).archive().of(name).exists()
+
+
+def test_small_files_that_are_damaged_or_gone_cost_no_trial(trained):
+    written, archive = mtimes(trained.folder / "trials"), trained.archive()
+    current, inputs = trained.folder / "trials/current.json", archive.of("one") / "inputs.json"
+    for file, text in ((current, None), (current, "{"), (inputs, ""), (inputs, "{")):
+        before = file.read_text()
+        file.unlink() if text is None else file.write_text(text)
+        train(load(trained.folder.parent))
+        assert file.read_text() == before
+    assert mtimes(trained.folder / "trials").keys() == written.keys()
+
+
 @pytest.mark.parametrize("file", ["trials/one/inputs.json", "replays/three/reference.inputs.json"])
 def test_a_folder_of_an_older_version_stays_as_it_is(study_file, tmp_path, file):
     path = tmp_path / "run" / file

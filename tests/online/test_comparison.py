@@ -96,6 +96,34 @@ def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, 
     assert f" by {0.5 * own:.2f} %, where the odometry's own parameters have {own:.2f} %," in said
 
 
+def test_where_training_lost_track_is_told(own):
+    assert not any("lost track" in said for said in compare(own).verdict)
+    model = ErrorModel.load(own.model_path)
+    first, fixed = model.sequence == 0, list(model.sets).index(model.fixed)
+    for columns, words in (
+        ([0], "In training, the odometry's own parameters lost track on one (RTE 30.0 %)."),
+        ([0, fixed], "own parameters lost track on one (RTE 30.0 %), and the fixed set lost"),
+    ):
+        errors = model.errors.copy()
+        errors[np.ix_(first, columns)] = np.inf
+        replace(model, errors=errors).save(own.model_path)
+        assert words in " ".join(compare(own).verdict)
+
+
+def test_a_damaged_front_is_named(own):
+    (own.folder / "front.json").write_text("hello {")
+    with pytest.raises(
+        StoredReplayError, match=r"front\.json: is damaged .*`adaptune offline` again"
+    ):
+        compare(own)
+
+
+def test_replays_with_a_model_for_another_budget_are_not_compared(own, study_file):
+    other = load_study(study_file, ["online.budget=1x"], own.folder)
+    with pytest.raises(AdaptuneError, match=r"online\.budget: .* was fitted for another one"):
+        compare(other)
+
+
 def test_where_track_is_lost_a_fault_of_the_odometry_is_named(own, monkeypatch):
     monkeypatch.setattr("adaptune.study.driven.LOST_ABOVE", -1.0)
     monkeypatch.setattr("online.compare.LOST_ABOVE", -1.0)

@@ -168,6 +168,30 @@ def test_the_test_may_contradict_training():
     assert "1.25 times the error (the test is too short to tell how sure that is; " in sure
 
 
+def test_a_test_outside_of_what_training_expected_is_told_as_that():
+    wide, narrow = front(), [row | {"low": 0.04, "high": 0.44} for row in front()]
+    assert said_of(every(), of_training=wide)[1].endswith(
+        "on another drive, expect 0.30 to 0.80 times."
+    )
+    assert said_of(every(), of_training=narrow)[1].endswith(
+        "by training, it was to be 0.04 to 0.44 times."
+    )
+
+
+def test_what_loses_track_is_not_driven_where_the_baseline_holds_it():
+    doubt = {"baseline": Ratio(10.0)}
+    rows = [replace(r, against=doubt) if r.mode == "fixed" else r for r in every(fixed=20.0)]
+    kept, why, *_ = said_of(rows)
+    assert kept.startswith("Keep the odometry's own parameters: 2.000 %")
+    assert why.startswith("The fixed set, which training recommends, loses track here, with 20.0 %")
+
+
+def test_where_nothing_else_was_tried_that_is_why_the_baseline_is_kept():
+    rows = every(baseline=1.0)
+    assert verdict(rows, 10.0, tried=1)[1].startswith("No other set was tried: allow more trials")
+    assert verdict(rows, 10.0, tried=2)[1].startswith("In training, the other set was not safely")
+
+
 def test_a_rule_of_the_user_s_is_named():
     of_rule = "`mine:Rule` had 0.95 times the fixed set's error (95 % interval 0.92 to 0.98), for "
     rows = every(adaptive=0.8, **{"mine:Rule": 0.95})

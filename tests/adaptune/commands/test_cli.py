@@ -191,6 +191,13 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f">{mode}</td>" in page
 
 
+def test_trials_of_another_study_are_not_shown_as_this_one_s(finished):
+    assert "Best mean" in commands.succeeded("trials", finished).output
+    other = commands.succeeded("trials", finished, "-o", "sub_trajectory=4.5").output
+    assert "another study's: sub_trajectory changed from 3.0 to 4.5. `adaptune off" in other
+    assert "Best mean" not in other
+
+
 @pytest.mark.parametrize(("rules", "next_one"), [(("adaptive",), "offline"), ((), "record")])
 def test_recordings_are_asked_for_only_where_something_adapts(
     adaptune, monkeypatch, rules, next_one
