@@ -352,10 +352,8 @@ class Campaign:
         if self._search.end != TIME_IS_UP:
             return []
         n, own, of = len(self._search.sets), len(self._baselines), self._config.most_trials
-        tried = f"{n} of {of}" if of else f"{n}"
-        return [
-            f"{tried} parameter sets were tried, {own} of them the odometry's own: {TIME_IS_UP}."
-        ]
+        tried, which = f"{n} of {of}" if of else f"{n}", f"{own} of them" if own < n else "none but"
+        return [f"{tried} parameter sets were tried, {which} the odometry's own: {TIME_IS_UP}."]
 
     def _begin(self) -> None:
         """Begin as many trials as can begin now."""
