@@ -142,7 +142,9 @@ def trials(
     title = f"{len(chosen)} of {len(finished)} trials"
     show_table(title, with_units(chosen, names, labels))
     if changed := loaded.archive().changes():
-        say(f"These are of another study: {'; '.join(changed)}. `adaptune offline` runs this one's.")
+        say(
+            f"These are of another study: {'; '.join(changed)}. `adaptune offline` runs this one's."
+        )
         return
     if judged := [row for row in finished if row["mean"] is not None]:
         best = min(judged, key=lambda row: row["mean"])
