@@ -4,6 +4,7 @@ All sets are compared with the baseline in pairs: by their mean errors over bloc
 sub-trajectories. `docs/research/price.md` has what other rules give.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
@@ -247,10 +248,10 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     if not few.any():
         cheapest = int(np.argmin(blocks.costs))
         raise AdaptuneError(
-            f"online.budget: {budget:g} ms of CPU time a scan is less than the cheapest of "
-            f"{len(blocks.trials)} parameter sets takes, {blocks.costs[cheapest]:.1f} ms (trial "
-            f"{blocks.trials[cheapest]}); allow more, or add cheaper sets (a coarser downsampling, "
-            f"fewer iterations, another odometry)"
+            f"online.budget (--budget): {budget:.3g} ms of CPU time a scan is less than the "
+            f"cheapest of {len(blocks.trials)} parameter sets takes, "
+            f"{blocks.costs[cheapest]:.1f} ms (trial {blocks.trials[cheapest]}); allow more, or "
+            f"add cheaper sets (a coarser downsampling, fewer iterations, another odometry)"
         )
     return np.asarray(few)
 
@@ -319,7 +320,7 @@ def elsewhere(blocks: BlockErrors, trial: int, bank: tuple[float, float] = (1.0,
     if not logs.any():
         return Elsewhere(1.0, 1.0, 1.0)
     (mean,), (error,) = mean_and_error(logs, blocks.sequence)
-    error = np.hypot(*(e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1])))
+    error = math.hypot(*(e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1])))
     of = np.array([logs[blocks.sequence == s].mean() for s in np.unique(blocks.sequence)])
     freedom = KNOWN_DRIVES + len(of) - 1
     variance = (KNOWN_DRIVES * SPREAD**2 + ((of - mean) ** 2).sum()) / freedom

@@ -53,8 +53,10 @@ USUAL_LENGTH = 5.0
 """Metres of the sub-trajectories to propose where the path is not known."""
 ROLES: dict[YamlPath, str] = {
     ("training",): "The part for the test is not trained on.",
-    ("sub_trajectory",): "Metres over which errors are measured: 10.0 for a path of 200 m or more, "
-    "25.0 for one of 500 m or more, or for a fast drive.",
+    (
+        "sub_trajectory",
+    ): "Metres over which errors are measured: 25.0 or 10.0 where the path of the "
+    "test holds 8 of these, else 5.0 or less; longer where that lasts less than 2 s.",
 }
 """Comments of what `roles` returns."""
 _COMMENTS: dict[YamlPath, str] = ROLES | {
