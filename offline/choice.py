@@ -4,7 +4,6 @@ All sets are compared with the baseline in pairs: by their mean errors over bloc
 sub-trajectories. `docs/research/price.md` has what other rules give.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
@@ -320,7 +319,7 @@ def elsewhere(blocks: BlockErrors, trial: int, bank: tuple[float, float] = (1.0,
     if not logs.any():
         return Elsewhere(1.0, 1.0, 1.0)
     (mean,), (error,) = mean_and_error(logs, blocks.sequence)
-    error = math.hypot(*(e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1])))
+    error = np.hypot(*(e if np.isfinite(e) else ONE_BLOCK for e in (error, bank[1])))
     of = np.array([logs[blocks.sequence == s].mean() for s in np.unique(blocks.sequence)])
     freedom = KNOWN_DRIVES + len(of) - 1
     variance = (KNOWN_DRIVES * SPREAD**2 + ((of - mean) ** 2).sum()) / freedom

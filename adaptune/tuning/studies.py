@@ -150,14 +150,8 @@ def write_study(
     if not path.exists():
         made = _decided(asked, overrides, folder, show)
         study, text = load_study(made, overrides, folder), dump(made, _COMMENTS)
-        try:
-            manifest.record(known, asked.inputs)
-            write_text(path, text)
-        except OSError as error:
-            raise AdaptuneError(
-                f"{folder}: cannot be written to ({error.strerror}); name another folder with "
-                f"--folder"
-            ) from error
+        manifest.record(known, asked.inputs)
+        write_text(path, text)
         _log.info("study: %s", path)
         return study, []
     if (before := manifest.recorded(known)) is None:
