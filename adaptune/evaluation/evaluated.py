@@ -54,12 +54,12 @@ class Evaluation:
     def verdict(self, most: float) -> Literal["above", "below", "unclear"]:
         """Whether any error is surely above so many percent, or surely none is.
 
-        What a trajectory does not give is not surely below.
+        What a trajectory does not give, or what is clipped, is not surely below.
         """
         ends = [one.interval or (0.0, math.inf) for one in self.judged]
         if any(low > most for low, _ in ends):
             return "above"
-        whole = all(one.silent_share < _SILENT for one in self.judged)
+        whole = all(one.silent_share < _SILENT and not one.bounded for one in self.judged)
         return "below" if whole and all(high <= most for _, high in ends) else "unclear"
 
     def __repr__(self) -> str:

@@ -171,6 +171,7 @@ def test_of_clipped_errors_only_the_least_is_said(bag, truth):
     assert "trajectory 1 on one is wrong by 30 % or more over 1 m, by /truth." in text
     assert " It was worst at 0.0 s, x 0.0 y 0.0 m: 30 % or more." in text
     assert "drifts" not in text
+    assert found.verdict(50.0) == "unclear"
     T = longer(truth, 1.01).T_world_sensor
     T[10:, 0, 3] += np.clip(np.arange(len(T) - 10.0), 0.0, 10.0)  # it goes astray for a second
     astray = Trajectory(truth.stamps, T)
