@@ -92,10 +92,7 @@ def entries(folder: Path, suffix: str = "") -> list[Path]:
 
 @contextmanager
 def needing_room(path: Path) -> Iterator[None]:
-    """Raise a FullError that names the file for which there is no room in the block.
-
-    Or its folder, where that cannot be written to.
-    """
+    """Raise a FullError where there is no room for a file, or its folder cannot be written to."""
     try:
         yield
     except OSError as error:

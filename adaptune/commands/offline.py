@@ -143,7 +143,7 @@ def trials(
     show_table(title, with_units(chosen, names, labels))
     if changed := loaded.archive().changes():
         say(
-            f"These are of another study: {'; '.join(changed)}. `adaptune offline` runs this one's."
+            f"These are another study's: {'; '.join(changed)}. `adaptune offline` makes this one's."
         )
         return
     if judged := [row for row in finished if row["mean"] is not None]:

@@ -22,8 +22,8 @@ _PLACES, _PATHS = 400, 6  # points of a path, and paths, that are drawn
 _ALIKE = "what all registrations of these scans get wrong alike, as a scale of the ranges"
 _CAPTION = (
     "RTE: mean error of sub-trajectories, in percent of their length; 30 stands for 30 or more. "
-    "Worst: where and when the "
-    "sub-trajectories had the greatest error. Unknown: share of the time without a reference."
+    "Worst: where and when the sub-trajectories had the greatest error. Unknown: share of the time "
+    "without a reference."
 )
 
 

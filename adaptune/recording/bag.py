@@ -492,11 +492,10 @@ class BagSource:
                 what = "is no bag, whatever its name says; give the recording itself"
                 raise SequenceError(f"{self.name}: {what}") from error
             beside = (self.paths[0].with_suffix(suffix) for suffix in (".tum", ".json"))
+            tools = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+            help_ = f"if the recording was cut short, repair it first ({tools})"
             if all(map(Path.exists, beside)):  # as of a simulated course
                 help_ = "`adaptune simulate --overwrite` with its study records its courses again"
-            else:
-                tools = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
-                help_ = f"if the recording was cut short, repair it first ({tools})"
             what = f"cannot be opened as a bag ({_say(error)}); {help_}"
             raise SequenceError(f"{self.name}: {what}") from error
         try:
