@@ -247,10 +247,10 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     if not few.any():
         cheapest = int(np.argmin(blocks.costs))
         raise AdaptuneError(
-            f"online.budget: {budget:g} ms of CPU time a scan is less than the cheapest of "
-            f"{len(blocks.trials)} parameter sets takes, {blocks.costs[cheapest]:.1f} ms (trial "
-            f"{blocks.trials[cheapest]}); allow more, or add cheaper sets (a coarser downsampling, "
-            f"fewer iterations, another odometry)"
+            f"online.budget (--budget): {budget:.3g} ms of CPU time a scan is less than the "
+            f"cheapest of {len(blocks.trials)} parameter sets takes, "
+            f"{blocks.costs[cheapest]:.1f} ms (trial {blocks.trials[cheapest]}); allow more, or "
+            f"add cheaper sets (a coarser downsampling, fewer iterations, another odometry)"
         )
     return np.asarray(few)
 

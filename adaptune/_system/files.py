@@ -11,7 +11,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import IO
@@ -25,6 +25,8 @@ DAMAGED_NPZ = (
     *(SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
 """What numpy and zipfile raise on damaged ``.npy`` and ``.npz`` files."""
+_BARRED = (errno.EACCES, errno.EPERM, errno.EROFS)
+_ELSEWHERE = "copy it, or name another folder (--folder, --out)"
 
 
 def expand_user(path: str) -> Path:
@@ -36,7 +38,7 @@ def expand_user(path: str) -> Path:
 
 
 class FullError(AdaptuneError, OSError):
-    """There is no room for a file."""
+    """There is no room for a file, or its folder cannot be written to."""
 
 
 def process_name(pid: int) -> str | None:
@@ -90,14 +92,23 @@ def entries(folder: Path, suffix: str = "") -> list[Path]:
 
 @contextmanager
 def needing_room(path: Path) -> Iterator[None]:
-    """Raise a FullError that names the file for which there is no room in the block."""
+    """Raise a FullError where there is no room for a file, or its folder cannot be written to."""
     try:
         yield
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        folder, named = path.parent, Path(str(error.filename))
+        if error.errno in _BARRED and named in path.parents:
+            folder = named.parent  # the other one was to be made there
+        if error.errno in (*_BARRED, errno.ENOTDIR, errno.EEXIST) and (
+            named in path.parents or folder in named.parents
+        ):
+            what, help_ = f"{folder}: cannot be written to", _ELSEWHERE
+        elif error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            what = f"{path}: cannot be written"
+            help_ = "make room, and run the same command again"
+        else:
             raise
-        help_ = "make room, and run the same command again"
-        raise FullError(f"{path}: cannot be written ({error.strerror}); {help_}") from error
+        raise FullError(f"{what} ({error.strerror}); {help_}") from error
 
 
 @contextmanager
@@ -116,9 +127,10 @@ def replacing(path: Path) -> Iterator[Path]:
         with needing_room(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-        temporary.replace(path)
+            temporary.replace(path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a disk without writing says so, whatever is there
+            temporary.unlink()
 
 
 @contextmanager

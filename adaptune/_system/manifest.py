@@ -93,7 +93,8 @@ def changes(
     if any(key == "odometry.name" for key, *_ in found):
         same = ("odometry.settings", "odometry.parameters", "content")  # of another odometry
         found = [each for each in found if not each[0].startswith(same)]
-    return [words for key, was, is_ in found for words in _words(key, was, is_, files or {})]
+    said = (words for key, was, is_ in found for words in _words(key, was, is_, files or {}))
+    return list(dict.fromkeys(said))
 
 
 def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:

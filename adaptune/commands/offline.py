@@ -58,7 +58,7 @@ def simulate(
         due = [n for n in courses if overwrite or not sequences.recording(n).exists()]
         for name in courses:
             if name not in due:
-                sequences.check_recorded(name)
+                sequences.open(name)  # it may be of another course, or cut short since
         for name in due:
             record(courses[name], sequences.recording(name), overwrite=overwrite, progress=show)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")

@@ -13,7 +13,7 @@ import numpy as np
 from adaptune._system.progress import Progress, bars_and_words
 from adaptune.errors import AdaptuneError
 from adaptune.evaluation.given import Convention, Named, by_name, convention, read
-from adaptune.evaluation.judged import Judge, Judged, pair_of
+from adaptune.evaluation.judged import Judge, Judged, pair_of, shared_stamps
 from adaptune.evaluation.shown import Compared, in_words, write_evaluation
 from adaptune.paired import ratio
 from adaptune.recording.config import ESTIMATED
@@ -54,12 +54,12 @@ class Evaluation:
     def verdict(self, most: float) -> Literal["above", "below", "unclear"]:
         """Whether any error is surely above so many percent, or surely none is.
 
-        What a trajectory does not give is not surely below.
+        What a trajectory does not give, or what is clipped, is not surely below.
         """
         ends = [one.interval or (0.0, math.inf) for one in self.judged]
         if any(low > most for low, _ in ends):
             return "above"
-        whole = all(one.silent_share < _SILENT for one in self.judged)
+        whole = all(one.silent_share < _SILENT and not one.bounded for one in self.judged)
         return "below" if whole and all(high <= most for _, high in ends) else "unclear"
 
     def __repr__(self) -> str:
@@ -107,7 +107,7 @@ def evaluate(
     if not trajectories:
         raise AdaptuneError("name a trajectory: a file of poses, or a topic")
     if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
-        raise AdaptuneError("sub_trajectory: give metres, more than 0")
+        raise AdaptuneError("--sub-trajectory: give metres, more than 0")
     given = [recordings] if isinstance(recordings, str | Path) else recordings
     by = convention(extrinsic, clock_offset, pose_time)
     chosen = None if reference is None else str(reference)
@@ -134,10 +134,13 @@ class _Asked(NamedTuple):
     by: Convention
     out: Path
     show: Progress
+    poses: Collection[Trajectory] = ()  # of the trajectories, on one recording
 
     def length_of(self, judge: Trajectory) -> float:
-        """Metres over which errors are measured."""
-        return self.length or check.proposed_sub_trajectory(judge, training=0.0)
+        """Metres over which errors are measured, as the paths that the judge knows allow."""
+        shared = [stamps for one in self.poses if len(stamps := shared_stamps(judge, one))]
+        paths = [Trajectory(stamps, judge.at(stamps)) for stamps in shared] or [judge]
+        return self.length or min(check.proposed_sub_trajectory(p, training=0.0) for p in paths)
 
 
 def _of_recording(name: str, found: Inspection, asked: _Asked) -> list[Judged]:
@@ -147,10 +150,11 @@ def _of_recording(name: str, found: Inspection, asked: _Asked) -> list[Judged]:
     scans, span = RecordedSequence(found.config()), found.scan.span if found.scan else 0
     # A trajectory that cannot be read is told before a reference is estimated.
     poses = {n: read(n, one, scans, asked.by, span) for n, one in asked.trajectories.items()}
+    asked = asked._replace(poses=poses.values())
     judge, place = _judge(name, found, scans, asked), asked.by.T_body_sensor
     judged = []
     for called, trajectory in poses.items():
-        stamps = judge.stamps(trajectory)
+        stamps = shared_stamps(judge.trajectory, trajectory)
         cause = diagnosis.diagnose_trajectory(trajectory, judge.trajectory, stamps, span, place)
         cause = None if judge.doubt else cause
         judged.append(Judged(called, judge, trajectory, stamps, cause))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.geometry import Poses
-from adaptune.metrics import LOST_ABOVE, span, travelled
+from adaptune.metrics import FAILURE, LOST_ABOVE, span, travelled
 from adaptune.paired import ERROR_FACTOR, Interval, Pair, in_cell, interval_of_mean
 from adaptune.recording.poses import sound
 from adaptune.reference.carried import stands
@@ -40,21 +40,22 @@ class Judge(NamedTuple):
         assert self.reference.trajectory is not None
         return self.reference.trajectory
 
-    def stamps(self, *others: Trajectory) -> NDArray[np.int64]:
-        """Where trajectories are judged: at the poses of the one that has the fewest, (n,).
 
-        All others go straight between theirs. In each gap of the judge lies one more, where nothing
-        is known: no sub-trajectory crosses it.
-        """
-        every = [self.trajectory.stamps, *(other.stamps for other in others)]
-        begin, end = max(one[0] for one in every), min(one[-1] for one in every)
-        within = [one[(one >= begin) & (one <= end)] for one in every]
-        gaps = np.diff(every[0]) > self.trajectory.max_gap * 1e9
-        middle = (every[0][:-1] + np.diff(every[0]) // 2)[gaps]
-        middle = middle[(middle > begin) & (middle < end)]
-        stamps = np.union1d(min(within, key=len), middle)
-        known = [np.isfinite(other.at(stamps)[:, 0, 0]) for other in others]
-        return np.asarray(stamps[np.all(known, axis=0) | np.isin(stamps, middle)])
+def shared_stamps(judge: Trajectory, *others: Trajectory) -> NDArray[np.int64]:
+    """Where trajectories are judged: at the poses of the one that has the fewest, (n,).
+
+    All others go straight between theirs. In each gap of the judge lies one more, where nothing is
+    known: no sub-trajectory crosses it.
+    """
+    every = [judge.stamps, *(other.stamps for other in others)]
+    begin, end = max(one[0] for one in every), min(one[-1] for one in every)
+    within = [one[(one >= begin) & (one <= end)] for one in every]
+    gaps = np.diff(every[0]) > judge.max_gap * 1e9
+    middle = (every[0][:-1] + np.diff(every[0]) // 2)[gaps]
+    middle = middle[(middle > begin) & (middle < end)]
+    stamps = np.union1d(min(within, key=len), middle)
+    known = [np.isfinite(other.at(stamps)[:, 0, 0]) for other in others]
+    return np.asarray(stamps[np.all(known, axis=0) | np.isin(stamps, middle)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +104,8 @@ class Judged:
         if np.isfinite(self.errors).any():
             return float(np.nanmean(self.errors))
         metres = self.judge.reference.length
-        what = f"no {metres:g} m of it can be judged; name a longer one, or a smaller length"
-        raise AdaptuneError(f"{self.title}: {what} (sub_trajectory)")
+        what = f"no {metres:g} m of it can be judged; name a longer one, or a smaller"
+        raise AdaptuneError(f"{self.title}: {what} --sub-trajectory")
 
     @cached_property
     def interval(self) -> Interval:
@@ -112,6 +113,11 @@ class Judged:
         known = self.errors[np.isfinite(self.errors)]
         block = span(self.truth, self.judge.reference.length)
         return interval_of_mean(known, block, self.judge.reference.error)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether most errors are clipped: their mean only says how wrong it is at least."""
+        return bool(np.nanmedian(self.errors) >= FAILURE)
 
     @property
     def blind(self) -> bool:
@@ -201,7 +207,7 @@ class Judged:
 def pair_of(one: Judged, other: Judged) -> Pair:
     """Two trajectories of a recording, at stamps that both have."""
     judge = one.judge
-    stamps = judge.stamps(one.trajectory, other.trajectory)
+    stamps = shared_stamps(judge.trajectory, one.trajectory, other.trajectory)
     errors = np.stack([Judged(j.name, judge, j.trajectory, stamps).errors for j in (one, other)])
     block = span(judge.trajectory.at(stamps), judge.reference.length)
     known = errors[:, np.isfinite(errors).all(axis=0)]

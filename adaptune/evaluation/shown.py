@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adaptune.evaluation.judged import Judged
-from adaptune.metrics import absolute_errors
-from adaptune.paired import Ratio, in_cell
+from adaptune.metrics import FAILURE, absolute_errors
+from adaptune.paired import Interval, Ratio, in_cell
 from adaptune.reference.diagnosis import OWN_ERROR
 from adaptune.reference.judge import columns_of
 from adaptune.report.charts import Axis, Chart, Line, Panel, Points
@@ -21,8 +21,9 @@ _NONE = 0.005  # percent of an error that is none
 _PLACES, _PATHS = 400, 6  # points of a path, and paths, that are drawn
 _ALIKE = "what all registrations of these scans get wrong alike, as a scale of the ranges"
 _CAPTION = (
-    "RTE: mean error of sub-trajectories, in percent of their length. Worst: where and when the "
-    "sub-trajectories had the greatest error. Unknown: share of the time without a reference."
+    "RTE: mean error of sub-trajectories, in percent of their length; 30 stands for 30 or more. "
+    "Worst: where and when the sub-trajectories had the greatest error. Unknown: share of the time "
+    "without a reference."
 )
 
 
@@ -45,13 +46,15 @@ def in_words(judged: Sequence[Judged], pairs: Sequence[Compared]) -> list[str]:
     for pair in pairs[:_SAID]:
         times = f"{pair.ratio.value:.2f} times {pair.other}'s error"
         ends = pair.ratio.interval
-        sure = f"95 % interval {ends[0]:.2f} to {ends[1]:.2f}" if ends else "too short to be sure"
         surely = ends is not None and ends[1] < 1.0
-        said.append(f"{'It surely' if surely else 'Nobody can tell; it'} has {times} ({sure}).")
+        first = "It surely" if surely else "Not sure that it is better: it"
+        said.append(f"{first} has {times} ({_sure(ends)}).")
     row = main.row
     where = f"{row['at [s]']:.1f} s, x {row['x [m]']:.1f} y {row['y [m]']:.1f} m"
     drift = f"{row['drift [m/100 m]']:.2g} m in a hundred, measured over {row['_drift_over_m']:g} m"
-    said.append(f"It drifts by {drift}; it was worst at {where}: {row['worst [%]']:.2g} %.")
+    begin = "It was" if main.bounded else f"It drifts by {drift}; it was"
+    more = " or more" * (row["worst [%]"] > FAILURE - _NONE)
+    said.append(f"{begin} worst at {where}: {row['worst [%]']:.2g} %{more}.")
     said += [f"{one.title}: {_listed(one.faults)}." for one in judged if one.faults][:_SAID]
     unknown = max(judged, key=lambda one: one.unknown_share)
     if unknown.unknown_share > 0.005:
@@ -77,8 +80,14 @@ def _error(one: Judged) -> str:
     if one.blind:
         most = max(ends[1] if ends else 0.0, one.rte)
         return f"{one.title} is better than can be told here: below {most:.2g} % {by}"
-    sure = f"95 % interval {ends[0]:.2f} to {ends[1]:.2f}" if ends else "too short for an interval"
-    return f"{one.title} is wrong by {one.rte:.2f} % ({sure}) {by}"
+    if one.bounded:
+        what = f"{one.title} is wrong by {one.rte:.3g} % or more over {reference.length:g} m"
+        return f"{what}, by {one.judge.name}."
+    return f"{one.title} is wrong by {one.rte:.2f} % ({_sure(ends)}) {by}"
+
+
+def _sure(ends: Interval) -> str:
+    return f"95 % interval {ends[0]:.2f} to {ends[1]:.2f}" if ends else "too short for an interval"
 
 
 def _listed(findings: Sequence[object]) -> str:

@@ -317,7 +317,7 @@ class Odometry(ABC):
 
     space: ClassVar[ParameterSpace]
     settings_type: ClassVar[type[BaseSettings]] = BaseSettings
-    live: ClassVar[bool]
+    live: ClassVar[bool] = False
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
     warm_up: ClassVar[float] = WARM_UP

@@ -87,7 +87,6 @@ class Pipeline(OwnFrameOdometry):
     """
 
     settings_type = EvalioSettings
-    live = False
     # Some end the process at unexpected scans, some share state between instances.
     clean = False
     pipeline: ClassVar[str]  # what evalio calls it

@@ -85,8 +85,6 @@ def odometry_class(name: str) -> type[Any]:
         return cls  # type: ignore[no-any-return]
     if not (isinstance(cls, type) and issubclass(cls, Odometry)):
         raise OdometryError(f"{name}: is not a class derived from adaptune.odometry.Odometry")
-    if lacking := [key for key in ("space", "live") if not hasattr(cls, key)]:
-        raise OdometryError(f"{name}: the class has no attribute {' and no '.join(lacking)}")
     for fault in _faults(cls):
         raise OdometryError(f"{name}: {fault}")
     return cls
@@ -94,10 +92,11 @@ def odometry_class(name: str) -> type[Any]:
 
 def _faults(cls: type[Odometry]) -> Iterator[str]:
     """What keeps a class from being made, in the words of its author."""
-    space: Any = cls.space
+    space: Any = getattr(cls, "space", None)
     if not isinstance(space, ParameterSpace):
         like = 'ParameterSpace({"x": Float(low=0.1, high=2.0, baseline=0.5)})'
-        yield f"its `space` is a {type(space).__name__}; write it as space = {like}"
+        what = "missing" if space is None else f"a {type(space).__name__}"
+        yield f"its `space` is {what}; write it as space = {like}"
     if lacking := sorted(cls.__abstractmethods__):
         yield f"the class lacks the method{'s' * (len(lacking) > 1)} {' and '.join(lacking)}"
     try:

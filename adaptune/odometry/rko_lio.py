@@ -68,7 +68,6 @@ class RkoLio(OwnFrameOdometry):
         min_beta=Float(low=10.0, high=5000.0, baseline=200.0, log=True),
     )
     settings_type = RkoLioSettings
-    live = False
     needs_imu = True
 
     @classmethod

@@ -491,10 +491,13 @@ class BagSource:
             if re.search("File magic is|not a database", str(error)):
                 what = "is no bag, whatever its name says; give the recording itself"
                 raise SequenceError(f"{self.name}: {what}") from error
-            raise SequenceError(
-                f"{self.name}: cannot be opened as a bag ({_say(error)}); if the recording was cut "
-                f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
-            ) from error
+            beside = (self.paths[0].with_suffix(suffix) for suffix in (".tum", ".json"))
+            tools = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+            help_ = f"if the recording was cut short, repair it first ({tools})"
+            if all(map(Path.exists, beside)):  # as of a simulated course
+                help_ = "`adaptune simulate --overwrite` with its study records its courses again"
+            what = f"cannot be opened as a bag ({_say(error)}); {help_}"
+            raise SequenceError(f"{self.name}: {what}") from error
         try:
             yield reader
         finally:

@@ -139,7 +139,7 @@ OWN_ERROR = "that is its own error, and no option mends it"
 
 
 class Mends(NamedTuple):
-    """What mends poses, as who gives them is told; braces stand for the value that was found."""
+    """What mends poses, as who gives them is told; braces stand for what was found."""
 
     clock: str = "add {:.3f} to `clock_offset`"
     place: str = "set `extrinsic: [{}]`, the LiDAR's pose in their frame"
@@ -159,7 +159,7 @@ _OF_ODOMETRY = Mends(
 )
 _OPTIONS = Mends(
     clock="add {:.3f} to `--clock-offset`",
-    place='give `--extrinsic "{}"`, the LiDAR\'s pose in their frame',
+    place='give `--extrinsic "{1}"`, the LiDAR\'s pose in their frame',
     own=OWN_ERROR,
     rare="write more poses a second",
     unturned="write the orientations, too",
@@ -437,7 +437,8 @@ def _places(T_world_body: Poses, hops: Hops, mends: Mends) -> Iterator[_Candidat
             f"{value + 0.0:.4g}"
             for value in (*t.round(3), *to_quaternions(place[None])[0].round(4))
         )
-        yield _Candidate(what, mends.place.format(numbers), T_world_body @ place)
+        mend = mends.place.format(numbers, numbers.replace(",", ""))
+        yield _Candidate(what, mend, T_world_body @ place)
 
 
 def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:

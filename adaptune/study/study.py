@@ -11,7 +11,7 @@ from typing import IO, Any, Generic, Literal
 from typing_extensions import TypeVar
 
 from adaptune._system import manifest, yaml12
-from adaptune._system.files import locked, write_text
+from adaptune._system.files import locked, needing_room, write_text
 from adaptune._system.machine import available
 from adaptune._system.strict import ConfigurationError
 from adaptune.errors import OdometryError
@@ -240,18 +240,13 @@ class Study(Generic[C_co]):
     def open(self) -> None:
         """Make and lock the folder, and write the resolved configuration to it.
 
-        There is a ConfigurationError if it cannot be made, or another process works in it.
+        There is a FullError if it cannot be, a ConfigurationError if another process works in it.
         """
         folder = self.folder
-        try:
+        with needing_room(folder / ".lock"):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigurationError(
-                f"{folder}: the study's folder cannot be made ({error.strerror}); name another "
-                f"with --folder"
-            ) from error
-        if folder.resolve() not in _locks:
-            lock = (folder / ".lock").open("w")
+            lock = None if folder.resolve() in _locks else (folder / ".lock").open("w")
+        if lock is not None:
             if not locked(lock, wait=False):
                 lock.close()
                 raise ConfigurationError(

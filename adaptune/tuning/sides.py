@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -16,7 +16,7 @@ from adaptune._system.files import plain_name
 from adaptune._system.machine import pin
 from adaptune._system.manifest import digest, plain
 from adaptune._system.progress import Progress, bars_and_words
-from adaptune._system.yaml12 import Document
+from adaptune._system.yaml12 import Document, YamlError
 from adaptune.errors import AdaptuneError
 from adaptune.odometry import Odometry
 from adaptune.odometry.base import ToolSettings
@@ -25,6 +25,7 @@ from adaptune.recording.fleet import Reading
 from adaptune.reference.check import greatest_speed
 from adaptune.space import in_words
 from adaptune.study.references import ensure_references
+from adaptune.study.study import CONFIGURATION
 from adaptune.tuning.asked import Asked, check_guarded, named_odometry, recorded, words_of
 from adaptune.tuning.studies import is_image
 from offline.config import OfflineStudy, load_study
@@ -146,6 +147,10 @@ def _studies(given: Sequence[str]) -> list[OfflineStudy]:
 
 def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> list[OfflineStudy]:
     """Both sides as studies of the same recordings."""
+    for side in given:
+        if isinstance(side, str) and _is_study(Path(side)):
+            bags = ", ".join(map(str, asked.recordings))
+            raise AdaptuneError(f"{side}: a study has its own recordings; leave {bags} out")
     named, _ = recorded(asked, show, alike=False)  # nothing is tuned on them
     names = list(named)
     shared: dict[str, Any] = {
@@ -172,6 +177,15 @@ def _driven(given: Sequence[Any], asked: Asked, show: Progress) -> list[OfflineS
 def _over(length: float, study: OfflineStudy) -> OfflineStudy:
     """The study with errors over another length."""
     return replace(study, config=study.config.model_copy(update={"sub_trajectory": length}))
+
+
+def _is_study(path: Path) -> bool:
+    if path.suffix not in (".yaml", ".yml") or not path.is_file():
+        return (path / CONFIGURATION).is_file()
+    with suppress(YamlError):  # files of parameters may be templates
+        data = Document.of_file(path).data
+        return isinstance(data, dict) and {"odometry", "training"} <= data.keys()
+    return False
 
 
 def _entry(given: Any, odometry: str) -> dict[str, Any]:

@@ -1,3 +1,4 @@
+import errno
 import sys
 from pathlib import Path
 
@@ -5,8 +6,7 @@ import pytest
 from needs import needs_evalio
 from setups import failure
 
-from adaptune._system.strict import ConfigurationError
-from adaptune.errors import import_extra
+from adaptune.errors import AdaptuneError, import_extra
 from offline.config import load_study
 
 STIFF = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
@@ -47,6 +47,21 @@ def test_a_budget_is_in_milliseconds_or_in_times_of_the_baseline(study_file):
         text = failure(study_file, f"online.budget={wrong}")
         assert "online.budget" in text
         assert "give milliseconds of CPU time a scan, or times the baseline's, as 3x" in text
+
+
+def test_a_folder_that_may_only_be_read_is_named(study_file, tmp_path, monkeypatch):
+    study, opened = load_study(study_file, folder=tmp_path / "ro"), Path.open
+
+    def barred(path, mode="r", **how):
+        if path.name == ".lock":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, mode, **how)
+
+    monkeypatch.setattr(Path, "open", barred)
+    with pytest.raises(
+        AdaptuneError, match=r"ro: cannot be written to \(Permission denied\); copy"
+    ):
+        study.open()
 
 
 def test_an_odometry_that_needs_an_imu(study_file):
@@ -149,7 +164,7 @@ def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline
 def test_a_folder_that_cannot_be_made(study_file, tmp_path):
     (tmp_path / "file").write_text("")
     study = load_study(study_file, [], tmp_path / "file/x")
-    with pytest.raises(ConfigurationError, match=r"file/x: the study's folder .*--folder"):
+    with pytest.raises(AdaptuneError, match=r"file/x: cannot be written to \(.*--folder"):
         study.open()
 
 

@@ -1,14 +1,25 @@
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 import pytest
 
 from adaptune._system.compiled import compiled
-from adaptune._system.files import locked, make_temporary, replacing, temporary_folder, write_text
+from adaptune._system.files import (
+    FullError,
+    locked,
+    make_temporary,
+    needing_room,
+    replacing,
+    replacing_folder,
+    temporary_folder,
+    write_text,
+)
 from adaptune.errors import lacking
 
 
@@ -37,6 +48,34 @@ def test_the_old_file_survives_a_failure(tmp_path, error):
         fail()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def barred(number, path):
+    return OSError(number, os.strerror(number), str(path))
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.EPERM])
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch, number):
+    path, words = tmp_path / "ro" / "a.txt", re.escape(os.strerror(number))
+    told = (
+        f"ro: cannot be written to \\({words}\\); copy it, or name another folder \\(--folder, --"
+    )
+    with pytest.raises(FullError, match=told), replacing(path) as beside:
+        raise barred(number, beside)
+    with pytest.raises(FullError, match=told), replacing_folder(path) as beside:
+        raise barred(number, beside / "inside")
+    with pytest.raises(FullError, match=told), needing_room(path):
+        raise barred(number, path.parent / "b.txt")
+    made = rf"{re.escape(str(tmp_path))}: cannot be written to"
+    with pytest.raises(FullError, match=made), needing_room(path):
+        raise barred(number, path.parent)  # which would be made
+    with pytest.raises(OSError, match=r"other\.txt") as error, replacing(path):
+        raise barred(number, tmp_path / "other.txt")
+    assert not isinstance(error.value, FullError)
+    # On such a disk, even what is not there cannot be removed.
+    monkeypatch.setattr(Path, "unlink", lambda self: (_ for _ in ()).throw(barred(number, self)))
+    with pytest.raises(FullError, match=told), replacing(path) as beside:
+        raise barred(number, beside)
 
 
 def test_two_writers_do_not_meet(tmp_path):

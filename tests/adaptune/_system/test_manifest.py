@@ -107,6 +107,11 @@ ONE, TWO = ["one/00000", "one/00001"], ["two/00000", "two/00001"]
         ({"a": {"b": 0.5}}, {"a": {"b": 0.25}}, ["a.b changed from 0.5 to 0.25"]),
         ({"a": {}}, {"a": {"b": 1}}, ["a.b is new"]),
         ({"content": {"module x": "0"}}, {"content": {}}, ["module x is gone"]),
+        (
+            {"courses": {"b": 1}, "recording": {"b": "0"}, "reference": {"b": "0"}},
+            {"courses": {}, "recording": {}, "reference": {}},
+            ["courses.b is gone", "b is gone"],
+        ),
         ({"content": {"x.sh": "0"}}, {"content": {"x.sh": "1"}}, ["x.sh has other content"]),
         ({"a": [1, 2]}, {"a": (1, 2)}, []),
         (None, {}, ["an older adaptune did not record what it depends on"]),

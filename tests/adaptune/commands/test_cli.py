@@ -248,6 +248,21 @@ def test_a_recording_of_another_course_is_refused(adaptune, tmp_path):
     assert f"{damaged.name}: is damaged, or of another adaptune; remove" in refused.stderr
 
 
+def test_a_recording_of_a_course_that_was_cut_short_is_told(adaptune, tmp_path):
+    (study := tmp_path / "one.yaml").write_text("odometry: gicp\n" + COURSE)
+    adaptune("simulate", study)
+    bag = tmp_path / "runs/one/recordings/c.bag"
+    os.truncate(bag, bag.stat().st_size // 2)
+    for command in (["simulate", study], ["offline", study], ["inspect", bag]):
+        refused = adaptune(*command)
+        assert refused.exit_code == 2
+        told = " ".join(refused.stderr.split())
+        assert "`adaptune simulate --overwrite` with its study records its courses again" in told
+        assert "reindex" not in told
+    assert "Recorded 1 of 1" in adaptune("simulate", study, "--overwrite").stdout
+    assert "Recorded 0 of 1" in adaptune("simulate", study).stdout
+
+
 @pytest.mark.parametrize(
     ("odometry", "lacking"),
     [

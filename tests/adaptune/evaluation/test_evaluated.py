@@ -160,6 +160,34 @@ def test_which_of_several_is_better_or_that_nobody_can_tell(bag, truth):
     text = " ".join(found.words)
     assert found.words[0].startswith("Best: trajectory 2")
     assert "It surely has 0.3" in text
+    words = evaluated(bag, *made[:2], reference="/truth", sub_trajectory=3.0).words
+    unsure = "Not sure that it is better: it has 0.33 times trajectory 1's error (too short for an "
+    assert unsure in " ".join(words)
+
+
+def test_of_clipped_errors_only_the_least_is_said(bag, truth):
+    found = evaluated(bag, longer(truth, 0.2), reference="/truth", sub_trajectory=1.0)
+    text = " ".join(found.words)
+    assert "trajectory 1 on one is wrong by 30 % or more over 1 m, by /truth." in text
+    assert " It was worst at 0.0 s, x 0.0 y 0.0 m: 30 % or more." in text
+    assert "drifts" not in text
+    assert found.verdict(50.0) == "unclear"
+    T = longer(truth, 1.01).T_world_sensor
+    T[10:, 0, 3] += np.clip(np.arange(len(T) - 10.0), 0.0, 10.0)  # it goes astray for a second
+    astray = Trajectory(truth.stamps, T)
+    text = " ".join(evaluated(bag, astray, reference="/truth", sub_trajectory=1.0).words)
+    assert "% (95 % interval " in text
+    assert "It drifts by " in text
+    assert text.count("30 % or more") == 1
+
+
+def test_the_length_suits_what_is_judged(bag, truth):
+    part = Trajectory(truth.stamps[:13], truth.T_world_sensor[:13])
+    lengths = [
+        evaluated(bag, *given, reference="/truth").judged[0].judge.reference.length
+        for given in ([truth], [part], [truth, part])
+    ]
+    assert lengths[0] > lengths[1] == lengths[2]
 
 
 def test_bags_with_the_same_topic_are_rows_the_worst_first(study_file, tmp_path, monkeypatch):
@@ -214,7 +242,7 @@ def test_what_the_poses_are_comes_first(bag, truth):
     found = evaluated(bag, wrong, reference="/truth")
     assert "of other axes" in found.words[0]
     mended = found.judged[0].cause.mend.split('"')[1]
-    numbers = [float(number) for number in mended.split(",")]
+    numbers = [float(number) for number in mended.split()]
     (one,) = evaluated(bag, wrong, reference="/truth", extrinsic=numbers).judged
     assert one.cause is None
     assert one.rte < 0.1
@@ -229,7 +257,11 @@ def test_what_the_poses_are_comes_first(bag, truth):
         ([], {}, "name a trajectory"),
         (["/truth"], {"pose_time": "middle"}, "pose_time: give stamp or end"),
         (["/truth"], {"sub_trajectory": -1.0}, "give metres, more than 0"),
-        (["/truth"], {"sub_trajectory": 50.0}, "no 50 m of it can be judged"),
+        (
+            ["/truth"],
+            {"sub_trajectory": 50.0},
+            "no 50 m of it can be judged; .* a smaller --sub-trajectory",
+        ),
         (["/truth"], {"extrinsic": [1.0, 2.0]}, "extrinsic: give numbers"),
         (["/truth"], {"extrinsic": "0, 0, 0, 1"}, "extrinsic: give numbers"),
         (["/truth"], {"reference": "none"}, "reference none: errors are measured by a reference"),

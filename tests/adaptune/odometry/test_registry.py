@@ -22,7 +22,6 @@ from adaptune.space import Float, ParameterSpace
 
 class Mine(Odometry):
     space = ParameterSpace({"x": Float(low=0, high=1, baseline=0.5)})
-    live = False
     def prepare(self, scan): ...
     def start(self, prepared, T_odom_sensor, T_previous_current=None): ...
     def register(self, prepared): ...
@@ -64,7 +63,7 @@ def mine(tmp_path, monkeypatch):
         ("my_odometry:Mime", "my_odometry has no Mime"),
         ("my_odometry:", "my_odometry has no class"),
         ("my_odometry:other", "not a class derived from adaptune.odometry.Odometry"),
-        ("my_odometry:Lacking", "has no attribute space and no live"),
+        ("my_odometry:Lacking", r"its `space` is missing; write it as space = ParameterSpace\(\{"),
         ("my_odometry:OfDict", r"its `space` is a dict; write it as space = ParameterSpace\(\{"),
         ("my_odometry:Half", "the class lacks the methods register and start"),
         ("my_odometry:Other", r"its __init__ takes \(voxel\); write __init__\(self, parameters="),
@@ -84,7 +83,8 @@ def test_a_parameter_without_its_baseline_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("mine")
-def test_a_class_may_take_more():
+def test_a_class_needs_space_and_methods_and_may_take_more():
+    assert not odometry_class("my_odometry:Mine").describe(None).live
     assert odometry_class("my_odometry:More").__name__ == "More"
 
 

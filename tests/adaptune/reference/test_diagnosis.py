@@ -368,8 +368,8 @@ def rarely(every):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (carried, '--extrinsic "-0.801, -0.3, '),
-        (turned, '--extrinsic "0, 0, 0, 0, 0, -0.707'),
+        (carried, '--extrinsic "-0.801 -0.3 '),
+        (turned, '--extrinsic "0 0 0 0 0 -0.707'),
         (invert, "look inverted"),
         (transposed, "rotations were transposed"),
         (quaternions([3, 0, 1, 2]), "qx qy qz qw"),
