@@ -60,7 +60,7 @@ def front_rows(data: LabelledData, model: ErrorModel, left_out: str = "") -> lis
     if (of_bank := model.expected) and len(members) > 1:
         by = of_bank["geometric"]
         error = by * means[list(blocks.trials).index(model.fixed)]
-        ratio = elsewhere(blocks, model.fixed, (by, of_bank["error"]))
+        ratio = elsewhere(blocks, model.fixed, (by, of_bank.get("error", np.inf)))
         row = _row([ADAPTIVE], error, costs.adaptive(members), ratio)
         row |= {"recommended": model.recommended == ADAPTIVE}
         row |= {"parameters": f"trials {', '.join(map(str, members))}", "odometry": ""}

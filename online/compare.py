@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -70,7 +70,7 @@ def compared_modes(replays: Replays) -> ComparedModes:
     finished = [name for name, there in made.items() if due.issubset(there)]
     # No mode is everywhere: those with the fixed set are compared.
     finished = finished or [name for name in names if "fixed" in made[name]]
-    if not names and (not finished or replays.model is not None):
+    if not finished and not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
         for mode in WITHOUT_MODEL if replays.model is None else (FIXED,):
@@ -196,10 +196,12 @@ def compare(study: Study) -> Comparison:
         If the model was fitted for another budget, or another bank.
     """
     replays = Replays.of(study)
-    if replays.model is not None:
-        replays.setup.check(study.model_file or study.model_path)
-    compared, model = compared_modes(replays), replays.model
+    compared = compared_modes(replays)
     names, modes = compared.sequences, compared.modes
+    # Where nothing was driven with it, it recommends nothing.
+    model = None if set(modes) <= set(WITHOUT_MODEL) else replays.model
+    if model is not None:
+        replays.setup.check(study.model_path)
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
     wrong: list[str] = []
@@ -232,9 +234,9 @@ def compare(study: Study) -> Comparison:
         whose = {} if model is None else _odometries(model)
         said += verdict(rows, length, recommended, front, obstacle, tried, whose)
         said += late(rows, advised, periods)
-        said += [] if model is None else _lost_in_training(model) + _of_estimates(study, model)
-        if recommended not in modes and not replays.setup.obstacle(recommended):
-            said += [] if model is None else compared.words
+        if model is not None:
+            said += _lost_in_training(model, whose) + _of_estimates(study, model)
+        said += _not_driven(replays, compared)
     details = [w for w in (*wrong, *remarks(rows), *compared.words) if w not in said]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -257,7 +259,17 @@ def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> l
     return [*said, "Until then, rely on none."] if said else []
 
 
-def _lost_in_training(model: ErrorModel) -> list[str]:
+def _not_driven(replays: Replays, compared: ComparedModes) -> list[str]:
+    """Why what training recommends is not compared, unless it is not possible."""
+    mode = FIXED if replays.model is None else replays.model.recommended
+    if replays.model is None or mode in compared.modes or replays.setup.obstacle(mode):
+        return []
+    if not replays.study.config.test:
+        return [f"Training recommends {called(mode)}: to compare it, name a test (test:)."]
+    return compared.words
+
+
+def _lost_in_training(model: ErrorModel, odometries: Mapping[str, str]) -> list[str]:
     """Where baseline and fixed set lost track in training, which decides more than how well."""
     found = dict[int, list[str]]()
     for number, name in enumerate(model.sequences):
@@ -266,7 +278,8 @@ def _lost_in_training(model: ErrorModel) -> list[str]:
         for trial, mean in zip(model.sets, means, strict=True):
             if trial in (rules.BASELINE, model.fixed) and LOST_ABOVE < mean < np.inf:
                 found.setdefault(trial, []).append(f"{name} (RTE {mean:.1f} %)")
-    who = {model.fixed: called(FIXED), rules.BASELINE: called(BASELINE)}
+    own = f"{odometries[BASELINE]}'s own parameters" if odometries else called(BASELINE)
+    who = {model.fixed: called(FIXED), rules.BASELINE: own}
     said = [f"{who[trial]} lost track on {', '.join(on)}" for trial, on in found.items()]
     return [f"In training, {', and '.join(said)}."] if said else []
 

@@ -42,13 +42,26 @@ def decided(rows: Sequence[ComparisonRow], recommended: str = FIXED) -> Comparis
         bank = last.get(UNTRAINED)
         better = bank is not None and FIXED not in last and _to_baseline(bank).interval
         return bank if better and better[1] < 1.0 else one or base
-    ends = _to_baseline(one).interval
-    worse = (ends is not None and ends[0] > 1.0) or _alone_loses_track(one, base)
-    return base if worse or _is_baseline(one) else one
+    kept = (last[m] for m in (recommended, FIXED) if m in last and not _fails(rows, last[m]))
+    one = next(kept, base)
+    return base if _is_baseline(one) else one
 
 
-def _alone_loses_track(row: ComparisonRow, other: ComparisonRow) -> bool:
-    return (other.rte or 0.0) <= LOST_ABOVE < (row.rte or 0.0)
+def _fails(rows: Sequence[ComparisonRow], row: ComparisonRow) -> bool:
+    """Whether a mode is surely worse than the baseline, or loses track where that does not."""
+    low, high = _to_baseline(row).interval or (0.0, math.inf)
+    return low > 1.0 or (high >= 1.0 and bool(_loses_track(rows, row.mode)))
+
+
+def _loses_track(rows: Sequence[ComparisonRow], mode: str) -> list[ComparisonRow]:
+    """Where a mode loses track, and the baseline, with less than half of its error, does not."""
+    of_base = {row.sequence: row.rte for row in rows if row.mode == BASELINE}
+    return [
+        row
+        for row in rows
+        if row.mode == mode and row.sequence in of_base and row.rte and row.rte > LOST_ABOVE
+        if (base := of_base[row.sequence]) and base < min(LOST_ABOVE, row.rte / 2.0)
+    ]
 
 
 def _to_baseline(row: ComparisonRow) -> Ratio:
@@ -155,7 +168,7 @@ def verdict(
     where = f"RTE over {length:g} m, {_where(rows)}{judge}"
     if best is base:
         said = [f"Keep {whose}: {_error_and_cost(best)} ({where})."]
-        said += _why_kept(best, last, recommended, tried)
+        said += _why_kept(rows, best, last, recommended, tried)
     else:
         named = [odometries[best.mode]] if best.mode in odometries else []
         named += [f"trial {trial}"] if best.mode == FIXED and trial else []
@@ -195,28 +208,33 @@ def _gained(
         worse = ", so perhaps more" * (own["low"] < 1.0 < own["high"])
         ends = f"{_end(own['low'])} to {_end(own['high'])}"
         expected = f"on another drive, expect {ends} times{worse}"
-        if not own["low"] <= ratio.value <= own["high"]:
-            expected = f"by training, it was to be {ends} times"
+        if not round(own["low"], 2) <= round(ratio.value, 2) <= round(own["high"], 2):
+            expected = f"training expected {ends} times"
         sure += f"; {expected}"
     return [f"{said}.", f"{sure}."]
 
 
 def _why_kept(
-    best: ComparisonRow, last: Mapping[str, ComparisonRow], recommended: str, tried: int
+    rows: Sequence[ComparisonRow],
+    best: ComparisonRow,
+    last: Mapping[str, ComparisonRow],
+    recommended: str,
+    tried: int,
 ) -> list[str]:
     """Why the odometry's own parameters are kept."""
-    other = last.get(recommended)
+    other = last.get(recommended, last.get(FIXED))
     if other is None or other is best or _is_baseline(other):
         if tried < 2:
             return ["No other set was tried: allow more trials, or more time."] * (FIXED in last)
         was = f"none of {tried - 1} other sets was" if tried > 2 else "the other set was not"
         return [f"In training, {was} safely better within the budget."] * (FIXED in last)
     ratio, what = _to_baseline(other), "is surely worse here"
-    if _alone_loses_track(other, best):
-        what = f"loses track here, with {other.rte:.1f} %"
+    if lost := [row for row in _loses_track(rows, other.mode) if row.sequence != ALL]:
+        what = "loses track on " + ", ".join(f"{row.sequence} ({row.rte:.1f} %)" for row in lost)
+    which = ", which training recommends," * (other.mode == recommended)
     return [
-        f"{called(recommended).capitalize()}, which training recommends, {what}: "
-        f"{ratio.value:.2f} times its error ({_interval(ratio)})."
+        f"{called(other.mode).capitalize()}{which} {what}: {ratio.value:.2f} times its error "
+        f"({_interval(ratio)})."
     ]
 
 

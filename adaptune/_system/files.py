@@ -26,7 +26,7 @@ DAMAGED_NPZ = (
 )
 """What numpy and zipfile raise on damaged ``.npy`` and ``.npz`` files."""
 _BARRED = (errno.EACCES, errno.EPERM, errno.EROFS)
-_ELSEWHERE = "copy it, or name another folder (--folder, --out)"
+_ELSEWHERE = "name another folder (--folder, --out), or copy it to where you may write"
 
 
 def expand_user(path: str) -> Path:
@@ -96,16 +96,17 @@ def needing_room(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        folder, named = path.parent, Path(str(error.filename))
-        if error.errno in _BARRED and named in path.parents:
-            folder = named.parent  # the other one was to be made there
-        if error.errno in (*_BARRED, errno.ENOTDIR, errno.EEXIST) and (
-            named in path.parents or folder in named.parents
-        ):
-            what, help_ = f"{folder}: cannot be written to", _ELSEWHERE
-        elif error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        named = Path(error.filename) if isinstance(error.filename, str) else path / ".."
+        above = named in path.parents  # a folder that was to be made
+        beside = named.parent == path.parent or f".{path.stem}." in str(named)
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             what = f"{path}: cannot be written"
             help_ = "make room, and run the same command again"
+        elif error.errno in _BARRED and (above or beside):
+            what = f"{named.parent if above else path.parent}: cannot be written to"
+            help_ = _ELSEWHERE
+        elif above and error.errno in (errno.ENOTDIR, errno.EEXIST):
+            what, help_ = f"{path.parent}: cannot be written to", _ELSEWHERE
         else:
             raise
         raise FullError(f"{what} ({error.strerror}); {help_}") from error

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -141,10 +142,11 @@ def trials(
     chosen = select(finished, sort, top, headings(names, labels))
     title = f"{len(chosen)} of {len(finished)} trials"
     show_table(title, with_units(chosen, names, labels))
-    if changed := loaded.archive().changes():
-        say(
-            f"These are another study's: {'; '.join(changed)}. `adaptune offline` makes this one's."
-        )
+    changed = list[str]()
+    with suppress(AdaptuneError):  # the odometry need not be here
+        changed = loaded.archive().changes()
+    if changed:
+        say(f"These trials are of another study: {'; '.join(changed)}. Run `adaptune offline`.")
         return
     if judged := [row for row in finished if row["mean"] is not None]:
         best = min(judged, key=lambda row: row["mean"])

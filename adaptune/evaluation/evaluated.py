@@ -59,7 +59,7 @@ class Evaluation:
         ends = [one.interval or (0.0, math.inf) for one in self.judged]
         if any(low > most for low, _ in ends):
             return "above"
-        whole = all(one.silent_share < _SILENT and not one.bounded for one in self.judged)
+        whole = all(one.silent_share < _SILENT and not one.clipped for one in self.judged)
         return "below" if whole and all(high <= most for _, high in ends) else "unclear"
 
     def __repr__(self) -> str:
@@ -107,7 +107,7 @@ def evaluate(
     if not trajectories:
         raise AdaptuneError("name a trajectory: a file of poses, or a topic")
     if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
-        raise AdaptuneError("--sub-trajectory: give metres, more than 0")
+        raise AdaptuneError("sub_trajectory (--sub-trajectory): give metres, more than 0")
     given = [recordings] if isinstance(recordings, str | Path) else recordings
     by = convention(extrinsic, clock_offset, pose_time)
     chosen = None if reference is None else str(reference)

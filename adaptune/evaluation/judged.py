@@ -115,6 +115,11 @@ class Judged:
         return interval_of_mean(known, block, self.judge.reference.error)
 
     @property
+    def clipped(self) -> bool:
+        """Whether any error is clipped."""
+        return bool((self.errors >= FAILURE).any())
+
+    @property
     def bounded(self) -> bool:
         """Whether most errors are clipped: their mean only says how wrong it is at least."""
         return bool(np.nanmedian(self.errors) >= FAILURE)

@@ -65,6 +65,7 @@ class Isolated(Faulting):
 
     isolated = True
     _checks_poses: ClassVar[bool] = True
+    _answered: ClassVar[float] = 0.0  # when any in this process answered last
 
     def __init__(
         self,
@@ -137,14 +138,17 @@ class Isolated(Faulting):
 
     def submit(self, prepared: Any) -> None:
         self._submitted, self._busy = prepared.stamp, True
-        self._waited -= time.perf_counter()
+        self._asked = time.perf_counter()
         header, arrays = self._scan(prepared)
         self._conversation.send({**header, "type": "register"}, **arrays)
 
     def _collect(self) -> Registration:
         """The answer to the submitted scan; NaN if there is none, or a wrong one."""
         answer = self._receive()
-        self._waited += time.perf_counter()
+        now = time.perf_counter()
+        # Of several that are asked at once, each is waited for after the one before.
+        self._waited += now - max(self._asked, Isolated._answered)
+        Isolated._answered = now
         self._busy = False
         if answer is None:
             return WITHOUT_POSE

@@ -495,7 +495,7 @@ class BagSource:
             tools = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
             help_ = f"if the recording was cut short, repair it first ({tools})"
             if all(map(Path.exists, beside)):  # as of a simulated course
-                help_ = "`adaptune simulate --overwrite` with its study records its courses again"
+                help_ += "; a simulated course is recorded anew by `adaptune simulate --overwrite`"
             what = f"cannot be opened as a bag ({_say(error)}); {help_}"
             raise SequenceError(f"{self.name}: {what}") from error
         try:

@@ -190,8 +190,8 @@ _TRIAL = re.compile(r"\d{5,}\.npz")
 
 CURRENT = "current.json"
 """By sequence, the name of the folder that was used last."""
-NAMED_BY_DIGEST = f"trials/*-{'[0-9a-f]' * manifest.SHORT}"
-"""The folders of sequences, below a study's."""
+NAMED_BY_DIGEST = f"-{'[0-9a-f]' * manifest.SHORT}"
+"""How the names of the folders of sequences end."""
 
 
 class Archive:
@@ -273,7 +273,7 @@ class Archive:
                 files = self._sources.files(name)
                 why |= dict.fromkeys(manifest.changes(before, self.inputs(name), files))
                 n += max(0, len(_trials(last)) - len(self.finished(name)))
-            if (self.of(name) / manifest.FILE).exists():
+            if self.of(name).exists():
                 self._use(name)
         if why:
             again = f"{n} trials are run again" if n else "since the last run"
@@ -291,8 +291,8 @@ class Archive:
     def changes(self) -> list[str]:
         """In what the study differs from that of the last trials, in words, recordings apart."""
         assert self._sources is not None
-        for name in self._last.values():
-            if before := manifest.recorded(self.folder / name / manifest.FILE):
+        for name in filter(self._last.get, self._sources.names):
+            if before := self._recorded(self.folder / self._last[name], name):
                 before = _of_poses(before)
                 return manifest.changes(before, before | _of_poses(self._sources.shared))
         return []

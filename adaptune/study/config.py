@@ -184,7 +184,7 @@ def read_budget(given: Any) -> float | str | None:
         times = isinstance(given, str) and given.endswith("x")
         number = float(given[:-1] if times else given)
         if not isinstance(given, bool) and 0.0 < number <= 1e6:
-            return str(given) if times else number
+            return f"{number:g}x" if times else number
     if given is None:
         return None
     raise ValueError("give milliseconds of CPU time a scan, or times the baseline's, as 3x")

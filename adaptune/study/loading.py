@@ -1,5 +1,6 @@
 """Reading a study: its YAML, the overrides, and its mistakes with their lines."""
 
+import glob
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -248,7 +249,8 @@ def read_study(
         said = dict.fromkeys(_say(m, given, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
     for older in ("trials/*/inputs.json", "replays/*/reference.inputs.json"):
-        of_now = (folder / "trials" / CURRENT).exists() or any(folder.glob(NAMED_BY_DIGEST))
+        now = (CURRENT, *(glob.escape(name) + NAMED_BY_DIGEST for name in config.training))
+        of_now = any(any((folder / "trials").glob(one)) for one in now)
         if any(folder.glob(older)) and not of_now:
             what = "its trials and replays are of an older adaptune, which kept them in another way"
             raise ConfigurationError(f"{folder}: {what}; run again with another --folder")

@@ -180,9 +180,9 @@ def _over(length: float, study: OfflineStudy) -> OfflineStudy:
 
 
 def _is_study(path: Path) -> bool:
-    if path.suffix not in (".yaml", ".yml") or not path.is_file():
-        return (path / CONFIGURATION).is_file()
-    with suppress(YamlError):  # files of parameters may be templates
+    with suppress(YamlError, OSError):  # files of parameters may be templates; commands are long
+        if path.suffix not in (".yaml", ".yml") or not path.is_file():
+            return (path / CONFIGURATION).is_file()
         data = Document.of_file(path).data
         return isinstance(data, dict) and {"odometry", "training"} <= data.keys()
     return False

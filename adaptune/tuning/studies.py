@@ -56,7 +56,7 @@ ROLES: dict[YamlPath, str] = {
     (
         "sub_trajectory",
     ): "Metres over which errors are measured: 25.0 or 10.0 where the path of the "
-    "test holds 8 of these, else 5.0 or less; longer where that lasts less than 2 s.",
+    "test is 8 times as long, else 5.0 or less; longer where that lasts less than 2 s.",
 }
 """Comments of what `roles` returns."""
 _COMMENTS: dict[YamlPath, str] = ROLES | {

@@ -40,6 +40,8 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
 
 
 def test_a_budget_is_in_milliseconds_or_in_times_of_the_baseline(study_file):
+    budgets = (load_study(study_file, [f"online.budget={b}"]).config.online for b in ("3x", "3.0x"))
+    assert len({one.budget for one in budgets}) == 1
     for given, milliseconds in (("15", 15.0), ("3x", 24.0), ("0.5x", 4.0), ("", None)):
         online = load_study(study_file, [f"online.budget={given}"]).config.online
         assert online.milliseconds(8.0) == milliseconds
@@ -59,7 +61,7 @@ def test_a_folder_that_may_only_be_read_is_named(study_file, tmp_path, monkeypat
 
     monkeypatch.setattr(Path, "open", barred)
     with pytest.raises(
-        AdaptuneError, match=r"ro: cannot be written to \(Permission denied\); copy"
+        AdaptuneError, match=r"ro: cannot be written to \(Permission denied\); name"
     ):
         study.open()
 

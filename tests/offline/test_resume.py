@@ -107,7 +107,7 @@ def test_a_folder_names_the_study_that_was_trained_in_it(trained):
 def test_small_files_that_are_damaged_or_gone_cost_no_trial(trained):
     written, archive = mtimes(trained.folder / "trials"), trained.archive()
     current, inputs = trained.folder / "trials/current.json", archive.of("one") / "inputs.json"
-    for file, text in ((current, None), (current, "{"), (inputs, ""), (inputs, "{")):
+    for file, text in ((current, None), (current, "{"), (inputs, None), (inputs, "{")):
         before = file.read_text()
         file.unlink() if text is None else file.write_text(text)
         train(load(trained.folder.parent))

@@ -161,6 +161,18 @@ def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, t
         "Not compared, because replays are missing: `baseline` on three; `adaptune online "
         "--untrained` makes them."
     ) in compare(both).verdict  # what is recommended was not driven
+    # Nothing that was is of the model.
+    other = own("test=[three, four]", four, "online.budget=2x")
+    assert compare(other).verdict[0].startswith("Keep the odometry's own parameters")
+
+
+def test_without_a_test_what_training_recommends_is_not_compared(own):
+    study = own("test=[]")
+    shutil.rmtree(study.folder / "replays", ignore_errors=True)
+    run_untrained(study)
+    found = compare(study)
+    assert found.model is None
+    assert found.verdict[-1].endswith(": to compare it, name a test (test:).")
 
 
 def test_the_command_line(own, study_file):

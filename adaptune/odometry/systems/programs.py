@@ -158,6 +158,10 @@ class ContainerTransport(processes.Transport):
         self.close()
         raise OdometryError(f"{self.name}: {what}")
 
+    def used(self) -> tuple[float, float] | None:
+        """See `processes.Transport`."""
+        return None if self._container is None else self._container.used()[1:]
+
     def why(self, what: str) -> str:
         if self._container is None:
             return what

@@ -58,7 +58,7 @@ def barred(number, path):
 def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch, number):
     path, words = tmp_path / "ro" / "a.txt", re.escape(os.strerror(number))
     told = (
-        f"ro: cannot be written to \\({words}\\); copy it, or name another folder \\(--folder, --"
+        f"ro: cannot be written to \\({words}\\); name another folder \\(--folder, --out\\), or cop"
     )
     with pytest.raises(FullError, match=told), replacing(path) as beside:
         raise barred(number, beside)
