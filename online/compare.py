@@ -198,10 +198,7 @@ def compare(study: Study) -> Comparison:
     replays = Replays.of(study)
     compared = compared_modes(replays)
     names, modes = compared.sequences, compared.modes
-    # Where nothing was driven with it, it recommends nothing.
-    model = None if set(modes) <= set(WITHOUT_MODEL) else replays.model
-    if model is not None:
-        replays.setup.check(study.model_path)
+    model = _driven_model(replays, modes)
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
     wrong: list[str] = []
@@ -257,6 +254,14 @@ def _lost(study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow) -> l
     faults = [row.run.fault for row in of_best if row.rte and row.rte > LOST_ABOVE]
     said = lost_in_words(study, called(best.mode), errors, faults)
     return [*said, "Until then, rely on none."] if said else []
+
+
+def _driven_model(replays: Replays, modes: Sequence[str]) -> ErrorModel | None:
+    """The model, if anything was driven with it; else it recommends nothing."""
+    if replays.model is None or set(modes) <= set(WITHOUT_MODEL):
+        return None
+    replays.setup.check(replays.study.model_path)
+    return replays.model
 
 
 def _not_driven(replays: Replays, compared: ComparedModes) -> list[str]:
