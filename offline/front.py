@@ -86,7 +86,7 @@ def in_short(data: LabelledData) -> str:
 
 def _row(roles: Sequence[str], error: float, cost: float, ratio: Elsewhere) -> dict[str, Any]:
     row = {"what": ", ".join(roles), ERROR: float(error), COST: cost}
-    row |= {"vs baseline": ratio.ratio, "low": ratio.low, "high": ratio.high}
+    row |= {"another drive": ratio.ratio, "low": ratio.low, "high": ratio.high}
     return row | {"file": next(filter(None, map(FILES.get, roles)), "")}
 
 

@@ -35,7 +35,7 @@ from online.statistics import (
     oracle_row,
 )
 from online.tables import tables
-from online.verdict import adapts, called, choices, decided, late, remarks, verdict
+from online.verdict import adapts, called, choices, decided, late, own_parameters, remarks, verdict
 
 _log = logging.getLogger(__name__)
 
@@ -283,8 +283,7 @@ def _lost_in_training(model: ErrorModel, odometries: Mapping[str, str]) -> list[
         for trial, mean in zip(model.sets, means, strict=True):
             if trial in (rules.BASELINE, model.fixed) and LOST_ABOVE < mean < np.inf:
                 found.setdefault(trial, []).append(f"{name} (RTE {mean:.1f} %)")
-    own = f"{odometries[BASELINE]}'s own parameters" if odometries else called(BASELINE)
-    who = {model.fixed: called(FIXED), rules.BASELINE: own}
+    who = {model.fixed: called(FIXED), rules.BASELINE: own_parameters(odometries)}
     said = [f"{who[trial]} lost track on {', '.join(on)}" for trial, on in found.items()]
     return [f"In training, {', and '.join(said)}."] if said else []
 

@@ -55,7 +55,7 @@ def _fails(rows: Sequence[ComparisonRow], row: ComparisonRow) -> bool:
 
 def _loses_track(rows: Sequence[ComparisonRow], mode: str) -> list[ComparisonRow]:
     """Where a mode loses track, and the baseline, with less than half of its error, does not."""
-    of_base = {row.sequence: row.rte for row in rows if row.mode == BASELINE}
+    of_base = {r.sequence: r.rte for r in rows if r.mode == BASELINE and r.sequence != ALL}
     return [
         row
         for row in rows
@@ -88,6 +88,13 @@ def _adapting(last: Mapping[str, ComparisonRow]) -> list[ComparisonRow]:
 def called(mode: str) -> str:
     """What a mode is called in a sentence."""
     return CALLED.get(mode, f"`{mode}`")
+
+
+def own_parameters(odometries: Mapping[str, str]) -> str:
+    """What the baseline is called; of several odometries, it names the one that a mode drives."""
+    return (
+        f"{odometries[BASELINE]}'s own parameters" if BASELINE in odometries else CALLED[BASELINE]
+    )
 
 
 def choices(
@@ -150,9 +157,7 @@ def verdict(
     Training `tried` so many sets, and recommends a mode; the `front` is that of `choices`;
     `obstacle` says why nothing adapts; of several `odometries`, it says which a mode drives.
     """
-    last, whose = _judged(rows), CALLED[BASELINE]
-    if BASELINE in odometries:
-        whose = f"{odometries[BASELINE]}'s own parameters"
+    last, whose = _judged(rows), own_parameters(odometries)
     if (best := decided(rows, recommended)) is None:
         nobody = "No test sequence has a reference"
         known = [row for row in rows if row.reference != "none" and row.sequence != ALL]
@@ -229,7 +234,7 @@ def _why_kept(
         was = f"none of {tried - 1} other sets was" if tried > 2 else "the other set was not"
         return [f"In training, {was} safely better within the budget."] * (FIXED in last)
     ratio, what = _to_baseline(other), "is surely worse here"
-    if lost := [row for row in _loses_track(rows, other.mode) if row.sequence != ALL]:
+    if lost := _loses_track(rows, other.mode):
         what = "loses track on " + ", ".join(f"{row.sequence} ({row.rte:.1f} %)" for row in lost)
     which = ", which training recommends," * (other.mode == recommended)
     return [

@@ -172,13 +172,11 @@ class Isolated(Faulting):
 
     def _used(self, header: dict[str, Any]) -> tuple[float, float]:
         """CPU seconds and megabytes, as the process tells them, or else as they are seen."""
-        seen = {}
+        cpu = memory = 0.0
         if "cpu" not in header:
             # Of one that runs elsewhere, nothing is seen but how long it takes.
-            used = self._conversation.transport.used() or (self._waited, 0.0)
-            seen = dict(zip(("cpu", "memory"), used, strict=True))
-        cpu, memory = (float((seen | header).get(key, 0.0)) for key in ("cpu", "memory"))
-        return cpu, memory
+            cpu, memory = self._conversation.transport.used() or (self._waited, 0.0)
+        return float(header.get("cpu", cpu)), float(header.get("memory", memory))
 
     def apply(self, selection: Selection) -> None:
         self.parameters |= selection.parameters
@@ -261,10 +259,7 @@ class ProgramTransport(processes.Transport):
         return processes.quoting(what, self._program.last_lines())
 
     def used(self) -> tuple[float, float] | None:
-        if self._program is None:
-            return None
-        ended = self._program.used()
-        return ended.cpu, ended.memory
+        return None if self._program is None else self._program.used()[1:]
 
     def close(self) -> None:
         if self._program is not None:

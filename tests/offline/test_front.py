@@ -28,9 +28,9 @@ def test_the_front_has_the_order_of_budgets_and_marks_what_is_recommended(study)
     assert least == sorted({*least})
     assert least[0] == 0
     (base,) = (row for row in rows if OWN in row["what"])
-    assert (base["trial"], base["vs baseline"]) == (0, 1.0)
+    assert (base["trial"], base["another drive"]) == (0, 1.0)
     for row in rows:
-        assert row["low"] <= row["vs baseline"] <= row["high"]
+        assert row["low"] <= row["another drive"] <= row["high"]
 
 
 def test_the_front_is_measured_on_another_recording(study):

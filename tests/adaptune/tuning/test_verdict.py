@@ -50,7 +50,7 @@ def test_the_file_agrees_with_the_front_of_training(study, found):
     for row in front:
         trained = rows["" if row["trial"] is None else str(row["trial"])]
         assert row["what"] == trained["what"].split(", ")[0]
-        for key in ("low", "high", "vs baseline"):
+        for key in ("low", "high", "another drive"):
             assert row[key] == float(trained[key])
         for key in ("file", "parameters", "left out"):
             assert row[key] == trained[key]
